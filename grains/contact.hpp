@@ -1,0 +1,72 @@
+// One contact: its data, the law it obeys, and how far it is from obeying it. Pure functions on values; loops live in solvers.cpp.
+#pragma once
+
+#include "geometry.hpp"
+
+namespace quicksand {
+
+template <int dim>
+struct Impulse {
+  double n = 0.0;                          // >= 0, pushes apart [N s] (2D: N s/m)
+  Tangent<dim> t = zero<Tangent<dim>>();   // friction [N s]
+};
+
+// A contact that the solver sees: n points from body i to body j, u = velocity of j relative to i at the contact.
+// Exact for discs and spheres: the local Delassus block is diagonal, W_tt = W_nn (1 + m r^2/I). Not so for clumps.
+template <int dim>
+struct Contact {
+  Vec<dim> n;
+  double bias;      // b_n in 0 <= u_n + b_n  perp  p_n >= 0 [m/s]
+  double inv_w;     // 1/W_nn [kg]
+  double friction;  // [-]
+  Impulse<dim> p;
+  int i, j;         // bodies
+  int pair;         // where the impulse is kept between steps
+};
+
+// The same with a wall in the place of body i. W_tt is stored: a wall may be light along one axis and held along another.
+template <int dim>
+struct WallContact {
+  Vec<dim> n;
+  double bias;
+  double inv_w;
+  double inv_w_t;  // 1/W_tt [kg]; for a wall free along some axes only: a bound, exact once the sweeps have converged
+  double friction;
+  Impulse<dim> p;
+  int wall, j;
+  int pair;
+};
+
+inline double clip(double t, double bound) { return std::clamp(t, -bound, bound); }
+inline Vec<3> clip(const Vec<3>& t, double bound) {
+  const double norm2 = t.squaredNorm();
+  return norm2 <= bound * bound ? t : Vec<3>(t * (bound / std::sqrt(norm2)));
+}
+
+// Signorini-Coulomb at one contact, the others held: M. Jean, CMAME 177 (1999), eqs. for a diagonal local block.
+//   0 <= u_n + b_n  perp  p_n >= 0,   |p_t| <= mu p_n,  p_t opposite to u_t when sliding
+// step_n = omega/W_nn, step_t = omega/W_tt; omega = 1 solves the contact exactly.
+template <int dim>
+Impulse<dim> obey_coulomb(const Impulse<dim>& p, double u_n, const Tangent<dim>& u_t, double step_n, double step_t,
+                          double friction) {
+  Impulse<dim> next;
+  next.n = std::max(p.n - step_n * u_n, 0.0);
+  next.t = clip(p.t - step_t * u_t, friction * next.n);
+  return next;
+}
+
+// e = r - P_K(r - rho (w + mu |w_t| n)), K = {|r_t| <= mu r_n}, rho = 1/W_nn: zero exactly when the contact obeys its law.
+// De Saxce and Feng, Math. Comput. Modelling 28 (1998). Returns |e|^2.
+template <int dim>
+double natural_map(const Impulse<dim>& p, double w_n, const Tangent<dim>& w_t, double rho, double friction) {
+  const double z_n = p.n - rho * (w_n + friction * std::sqrt(squared(w_t)));
+  const Tangent<dim> z_t = p.t - rho * w_t;
+  const double norm_t = std::sqrt(squared(z_t));
+  if (norm_t <= friction * z_n) return (p.n - z_n) * (p.n - z_n) + squared(Tangent<dim>(p.t - z_t));
+  if (friction * norm_t <= -z_n) return p.n * p.n + squared(p.t);
+  const double on_cone = (z_n + friction * norm_t) / (1.0 + friction * friction);
+  const double scale = norm_t > 0 ? friction * on_cone / norm_t : 0.0;
+  return (p.n - on_cone) * (p.n - on_cone) + squared(Tangent<dim>(p.t - scale * z_t));
+}
+
+}  // namespace quicksand

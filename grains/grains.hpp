@@ -1,0 +1,108 @@
+// The state of a scene: grains, walls, materials, and the box they live in. No behaviour beyond what keeps the arrays consistent.
+#pragma once
+
+#include "geometry.hpp"
+
+#include <array>
+#include <cstdint>
+#include <map>
+#include <string>
+#include <vector>
+
+namespace quicksand {
+
+// Discs or spheres, kept sorted in space (the order changes when neighbours are found anew; `id` does not).
+template <int dim>
+struct Grains {
+  std::vector<Vec<dim>> x;            // centre [m], wrapped into the box only when neighbours are found anew
+  std::vector<Body<dim>> body;        // velocity, spin, inverse mass
+  std::vector<double> r;              // radius [m]
+  std::vector<std::int32_t> id;       // order of adding, >= 0; grains fixed to a wall: -1, -2, ...
+  std::vector<std::int16_t> wall;     // wall that carries this grain; -1: free
+  std::vector<std::uint8_t> material;
+  std::vector<Vec<dim>> force;        // external force [N] (2D: N/m); empty when there is none
+  double inertia = Rotation<dim>::inertia;  // I/(m r^2) of every grain [-]
+
+  int size() const { return static_cast<int>(x.size()); }
+};
+
+// A rigid body that does not turn. Along each axis either its velocity is given (inv_m = 0) or its load (inv_m > 0).
+template <int dim>
+struct Wall {
+  enum class Shape { plane, segment };
+  Shape shape = Shape::plane;
+  Vec<dim> point = Vec<dim>::Zero();   // a point of the plane, or the segment's start [m]
+  Vec<dim> normal = Vec<dim>::Zero();  // unit; the grains are on its side. Plane only: a segment is met from both sides
+  Vec<dim> span = Vec<dim>::Zero();    // end - start of a segment [m]
+  Vec<dim> v = Vec<dim>::Zero();       // velocity [m/s]
+  Vec<dim> inv_m = Vec<dim>::Zero();   // inverse mass per axis [1/kg] (2D: m/kg); 0: driven by velocity
+  Vec<dim> load = Vec<dim>::Zero();    // external force on load-driven axes [N] (2D: N/m)
+  std::array<bool, dim> loaded{};      // which axes are driven by load
+  double mass = 0.0;                   // of the load-driven axes [kg] (2D: kg/m); 0: a tenth of the grains' mass, set at the first step
+  std::uint8_t material = 0;
+  Vec<dim> force = Vec<dim>::Zero();   // mean contact force on the wall over the last step [N] (2D: N/m)
+  Vec<dim> moved = Vec<dim>::Zero();   // way since neighbours were last found [m]
+};
+
+// Friction and restitution for every pair of materials. Restitution: u_n+ = -normal u_n-, u_t+ = -tangential u_t-.
+class Materials {
+ public:
+  struct Pair {
+    double friction = -1.0;  // [-]; negative: never set
+    double normal = 0.0;
+    double tangential = 0.0;
+  };
+  std::uint8_t find(const std::string& name, const char* where) const;  // throws std::invalid_argument: unknown
+  std::uint8_t find_or_add(const std::string& name);
+  const std::vector<std::string>& names() const { return names_; }
+  Pair& pair(int a, int b) { return pairs_[index(a, b)]; }
+  const Pair& pair(int a, int b) const { return pairs_[index(a, b)]; }
+
+ private:
+  static int index(int a, int b) { return a > b ? a * (a + 1) / 2 + b : b * (b + 1) / 2 + a; }
+  std::vector<std::string> names_;
+  std::vector<Pair> pairs_;
+};
+
+// [-L/2, L/2) along periodic axes, unbounded along the others.
+template <int dim>
+struct Box {
+  Vec<dim> period = Vec<dim>::Zero();  // L [m]; 0: not periodic
+
+  // From a to b, the shortest way.
+  Vec<dim> nearest(Vec<dim> ab) const {
+    for (int k = 0; k < dim; ++k)
+      if (period[k] > 0) ab[k] -= period[k] * std::nearbyint(ab[k] / period[k]);
+    return ab;
+  }
+  Vec<dim> wrap(Vec<dim> x) const {
+    for (int k = 0; k < dim; ++k)
+      if (period[k] > 0) {
+        x[k] -= period[k] * std::floor(x[k] / period[k] + 0.5);
+        if (x[k] >= 0.5 * period[k]) x[k] = -0.5 * period[k];  // rounding of the line above
+      }
+    return x;
+  }
+};
+
+// Where a wall is nearest to a grain's centre: unit normal from wall to grain, distance from wall to centre [m].
+template <int dim>
+struct NearWall {
+  Vec<dim> n;
+  double distance;
+};
+
+template <int dim>
+NearWall<dim> nearest_point(const Wall<dim>& wall, const Vec<dim>& x, const Box<dim>& box) {
+  if (wall.shape == Wall<dim>::Shape::plane) return {wall.normal, (x - wall.point).dot(wall.normal)};
+  const Vec<dim> from_middle = box.nearest(x - wall.point - 0.5 * wall.span);
+  const double along = std::clamp(from_middle.dot(wall.span) / wall.span.squaredNorm(), -0.5, 0.5);
+  const Vec<dim> away = from_middle - along * wall.span;
+  const double distance = away.norm();
+  if (distance > 0) return {away / distance, distance};
+  Vec<dim> n = Vec<dim>::Zero();  // a centre exactly on the segment: either side will do
+  n[0] = -wall.span[1], n[1] = wall.span[0];
+  return {n.normalized(), 0.0};
+}
+
+}  // namespace quicksand

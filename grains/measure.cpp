@@ -1,0 +1,65 @@
+#include "measure.hpp"
+
+#include <complex>
+#include <stdexcept>
+
+namespace quicksand {
+
+template <int dim>
+Profile<dim> profile(const Simulation<dim>& simulation, int axis, double low, double high, int bins) {
+  if (axis < 0 || axis >= dim || !(high > low) || bins < 1)
+    throw std::invalid_argument("profile: needs an axis of the scene, low < high [m] and at least one bin");
+  const Grains<dim>& grains = simulation.grains();
+  Profile<dim> out;
+  out.solid.assign(bins, 0.0);
+  out.momentum.assign(bins, Vec<dim>::Zero());
+  out.second.assign(bins, Vec<dim>::Zero());
+  const double thickness = (high - low) / bins;
+  for (int k = 0; k < grains.size(); ++k) {
+    if (grains.wall[k] >= 0) continue;
+    const double r = grains.r[k], y = simulation.box().wrap(grains.x[k])[axis];
+    const int first = std::max(0, static_cast<int>(std::floor((y - r - low) / thickness)));
+    const int last = std::min(bins - 1, static_cast<int>(std::floor((y + r - low) / thickness)));
+    double below = first <= last ? solid_below<dim>(r, low + first * thickness - y) : 0.0;
+    for (int b = first; b <= last; ++b) {
+      const double next = solid_below<dim>(r, low + (b + 1) * thickness - y);
+      const Vec<dim>& v = grains.body[k].v;
+      out.solid[b] += next - below;
+      out.momentum[b] += (next - below) * v;
+      out.second[b] += (next - below) * v.cwiseAbs2();
+      below = next;
+    }
+  }
+  return out;
+}
+
+double psi6(const Simulation<2>& simulation, double low, double high) {
+  const Grains<2>& grains = simulation.grains();
+  std::vector<Vec<2>> x;
+  std::vector<double> r;
+  for (int k = 0; k < grains.size(); ++k)
+    if (grains.wall[k] < 0) x.push_back(simulation.box().wrap(grains.x[k])), r.push_back(grains.r[k]);
+  const CloseGrains<2> close(x, r, simulation.box(), 1.3, 0.0);
+  std::vector<std::complex<double>> order(x.size());
+  std::vector<int> neighbours(x.size(), 0);
+  for (std::size_t i = 0; i < x.size(); ++i)
+    close.visit(static_cast<int>(i), [&](int a, int b, int code) {
+      const Vec<2> branch = x[b] - x[a] + periodic_shift(simulation.box(), code);
+      const std::complex<double> bond = std::polar(1.0, 6.0 * std::atan2(branch.y(), branch.x()));
+      order[a] += bond, order[b] += bond;  // 6 theta and 6 (theta + pi) are the same angle
+      ++neighbours[a], ++neighbours[b];
+    });
+  double sum = 0.0;
+  int n = 0;
+  for (std::size_t i = 0; i < x.size(); ++i) {
+    if (x[i].y() < low || x[i].y() > high) continue;
+    ++n;
+    if (neighbours[i] > 0) sum += std::abs(order[i]) / neighbours[i];
+  }
+  return sum / n;
+}
+
+template Profile<2> profile(const Simulation<2>&, int, double, double, int);
+template Profile<3> profile(const Simulation<3>&, int, double, double, int);
+
+}  // namespace quicksand

@@ -1,0 +1,371 @@
+// Sorting, listing and arranging of neighbours: see neighbours.hpp for what and why.
+#include "neighbours.hpp"
+
+#include <numeric>
+
+namespace quicksand {
+
+namespace {
+
+// Lowest and highest centre along each axis; the box where it is periodic.
+template <int dim>
+std::pair<Vec<dim>, Vec<dim>> extent(std::span<const Vec<dim>> x, const Box<dim>& box) {
+  Vec<dim> low = Vec<dim>::Constant(0), high = low;
+  if (!x.empty()) low = high = x[0];
+  for (const Vec<dim>& p : x) low = low.cwiseMin(p), high = high.cwiseMax(p);
+  for (int k = 0; k < dim; ++k)
+    if (box.period[k] > 0) low[k] = -0.5 * box.period[k], high[k] = 0.5 * box.period[k];
+  return {low, high};
+}
+
+// Cells no smaller than `size` that fill [low, high]; at most `most` of them, so that a grain far away costs no memory.
+template <int dim>
+std::array<int, dim> count_cells(const Vec<dim>& low, const Vec<dim>& high, double size, double most) {
+  std::array<int, dim> cells{};
+  for (;; size *= 1.5) {
+    double total = 1;
+    for (int k = 0; k < dim; ++k) total *= std::max(1.0, std::floor((high[k] - low[k]) / size));
+    if (total > most) continue;
+    for (int k = 0; k < dim; ++k) cells[k] = std::max(1, static_cast<int>((high[k] - low[k]) / size));
+    return cells;
+  }
+}
+
+template <int dim>
+Vec<dim> inverse_size(const Vec<dim>& low, const Vec<dim>& high, const std::array<int, dim>& cells) {
+  Vec<dim> inv;
+  for (int k = 0; k < dim; ++k) inv[k] = high[k] > low[k] ? cells[k] / (high[k] - low[k]) : 0.0;
+  return inv;
+}
+
+template <int dim>
+std::array<int, dim> cell_at(const Vec<dim>& x, const Vec<dim>& low, const Vec<dim>& inv, const std::array<int, dim>& cells) {
+  std::array<int, dim> c;
+  for (int k = 0; k < dim; ++k) c[k] = std::clamp(static_cast<int>((x[k] - low[k]) * inv[k]), 0, cells[k] - 1);
+  return c;
+}
+
+template <class T>
+void permute(std::vector<T>& values, const std::vector<int>& order) {
+  if (values.empty()) return;
+  std::vector<T> sorted(values.size());
+  for (std::size_t k = 0; k < order.size(); ++k) sorted[k] = values[order[k]];
+  values.swap(sorted);
+}
+
+// Sorts the integers 0 ... keys.size() - 1 by key, stably; `start` gets where each key begins.
+std::vector<int> sort_by_key(const std::vector<int>& keys, int n_keys, std::vector<int>& start) {
+  start.assign(n_keys + 1, 0);
+  for (int k : keys) ++start[k + 1];
+  std::partial_sum(start.begin(), start.end(), start.begin());
+  std::vector<int> next(start.begin(), start.end() - 1), order(keys.size());
+  for (std::size_t i = 0; i < keys.size(); ++i) order[next[keys[i]]++] = static_cast<int>(i);
+  return order;
+}
+
+// Impulses of the old list, to be found by the new numbers of their grains.
+template <int dim, class OldPair>
+class Known {
+ public:
+  template <class Key>
+  Known(const std::vector<OldPair>& old, int grains, Key&& key) {
+    std::vector<int> keys;
+    for (const OldPair& pair : old)
+      if (pair.p.n > 0) entries_.push_back(pair), keys.push_back(key(entries_.back()));
+    order_ = sort_by_key(keys, grains, start_);
+  }
+  template <class Same>
+  Impulse<dim> find(int key, Same&& same) const {
+    for (int k = start_[key]; k < start_[key + 1]; ++k)
+      if (same(entries_[order_[k]])) return entries_[order_[k]].p;
+    return {};
+  }
+
+ private:
+  std::vector<OldPair> entries_;
+  std::vector<int> start_, order_;
+};
+
+}  // namespace
+
+template <int dim>
+CloseGrains<dim>::CloseGrains(std::span<const Vec<dim>> x, std::span<const double> r, const Box<dim>& box, double factor,
+                              double skin)
+    : x_(x), r_(r), box_(box), factor_(factor), skin_(skin), level_of_(x.size()) {
+  const double r_min = r.empty() ? 1.0 : *std::min_element(r.begin(), r.end());
+  for (std::size_t i = 0; i < x.size(); ++i) {
+    const auto l = static_cast<std::size_t>(std::log2(r[i] / r_min));
+    if (l >= levels_.size()) levels_.resize(l + 1);
+    level_of_[i] = static_cast<std::uint8_t>(l);
+    levels_[l].r_max = std::max(levels_[l].r_max, r[i]);
+    levels_[l].grains.push_back(static_cast<int>(i));
+  }
+  const auto [low, high] = extent(x, box);
+  std::vector<int> keys;
+  for (Level& level : levels_) {
+    if (level.grains.empty()) continue;
+    level.low = low;
+    level.cells = count_cells<dim>(low, high, factor * 2 * level.r_max + skin, 4.0 * level.grains.size() + 64);
+    level.inv_size = inverse_size<dim>(low, high, level.cells);
+    keys.clear();
+    for (int i : level.grains) keys.push_back(cell_of(level, x[i]));
+    int total = 1;
+    for (int c : level.cells) total *= c;
+    for (int k : sort_by_key(keys, total, level.start)) level.member.push_back(level.grains[k]);
+  }
+}
+
+template <int dim>
+int CloseGrains<dim>::cell_of(const Level& level, const Vec<dim>& x) const {
+  const auto c = cell_at<dim>(x, level.low, level.inv_size, level.cells);
+  int cell = c[0];
+  for (int k = 1; k < dim; ++k) cell = cell * level.cells[k] + c[k];
+  return cell;
+}
+
+template <int dim>
+void Neighbours<dim>::sort(Grains<dim>& grains, const Box<dim>& box) {
+  const int n = grains.size();
+  for (Vec<dim>& x : grains.x) x = box.wrap(x);
+  double r_max = 0.0, r_mean = 0.0;
+  for (double r : grains.r) r_max = std::max(r_max, r), r_mean += r / n;
+  // A pair k cells apart (k >= 2) starts at least (k-1) B - d_max apart and, if neighbouring cells move by less than skin
+  // relative to each other, nears by less than k skin: unlisted pairs far apart are safe when B >= d_max + 2 skin.
+  // Larger cells cost less to check and allow less motion: three mean diameters was the best of two to five.
+  const double size = std::max(2 * r_max + 2 * skin_, 6 * r_mean);
+  const auto [low, high] = extent<dim>(grains.x, box);
+  cells_ = count_cells<dim>(low, high, size, 2.0 * n + 64);
+  const Vec<dim> inv = inverse_size<dim>(low, high, cells_);
+
+  // Slowest along the longest side: blocks are slices of it and meet few others. A wide cell is cut once more for locality.
+  std::array<int, dim> axes;
+  std::iota(axes.begin(), axes.end(), 0);
+  std::stable_sort(axes.begin(), axes.end(), [&](int a, int b) { return high[a] - low[a] > high[b] - low[b]; });
+  const int cut = std::clamp(static_cast<int>(size / (6 * r_mean)), 1, 16);
+  std::array<int, dim> fine;
+  for (int k = 0; k < dim; ++k) fine[k] = cells_[k] * cut;
+  const Vec<dim> inv_fine = inv * cut;
+  int parts = 1, total = 1;
+  for (int k = 0; k < dim; ++k) parts *= cut, total *= cells_[k];
+  std::vector<int> keys(n), start;
+  for (int i = 0; i < n; ++i) {
+    const auto c = cell_at<dim>(grains.x[i], low, inv_fine, fine);
+    int cell = 0, part = 0;
+    for (int k : axes) cell = cell * cells_[k] + c[k] / cut, part = part * cut + c[k] % cut;
+    keys[i] = cell * parts + part;
+  }
+  const std::vector<int> order = sort_by_key(keys, total * parts, start);
+  cell_start_.resize(total + 1);
+  for (int c = 0; c <= total; ++c) cell_start_[c] = start[c * parts];
+  new_of_old_.resize(n);
+  for (int k = 0; k < n; ++k) new_of_old_[order[k]] = k;
+  permute(grains.x, order);
+  permute(grains.body, order);
+  permute(grains.r, order);
+  permute(grains.id, order);
+  permute(grains.wall, order);
+  permute(grains.material, order);
+  permute(grains.force, order);
+  // valid() walks the cells in the order of `axes`
+  std::array<int, dim> reordered;
+  for (int k = 0; k < dim; ++k) reordered[k] = cells_[axes[k]], around_[k] = box.period[axes[k]] > 0;
+  cells_ = reordered;
+  x_found_ = grains.x;
+}
+
+template <int dim>
+void Neighbours<dim>::list(const Grains<dim>& grains, const std::vector<Wall<dim>>& walls, const Box<dim>& box,
+                           int threads) {
+  const int n = grains.size();
+  const CloseGrains<dim> close(grains.x, grains.r, box, 1.0, skin_);
+  const int n_blocks = (n + block_size - 1) / block_size;
+  found_in_block_.resize(n_blocks);
+#pragma omp parallel for num_threads(threads) schedule(static)
+  for (int b = 0; b < n_blocks; ++b) {
+    Found& found = found_in_block_[b];
+    found.pairs.clear();
+    found.wall_pairs.clear();
+    for (int i = b * block_size; i < std::min(n, (b + 1) * block_size); ++i) {
+      close.visit(i, [&](int a, int c, int code) {
+        if (grains.wall[a] >= 0 && grains.wall[c] >= 0) return;
+        if (grains.id[a] > grains.id[c]) std::swap(a, c), code = shift_back<dim>(code);
+        if (grains.wall[a] >= 0)  // grains fixed to a wall have the lower ids
+          found.wall_pairs.push_back({grains.wall[a], a, c, code, {}});
+        else
+          found.pairs.push_back({a, c, code, {}});
+      });
+      if (grains.wall[i] >= 0) continue;
+      for (std::size_t w = 0; w < walls.size(); ++w)
+        if (nearest_point(walls[w], grains.x[i], box).distance - grains.r[i] < 2 * skin_)
+          found.wall_pairs.push_back({static_cast<int>(w), -1, i, shift_back<dim>(0) / 2, {}});
+    }
+  }
+  // What valid() needs to know of the grains that are not listed with a wall
+  const int n_cells = static_cast<int>(cell_start_.size()) - 1;
+  cell_wall_gap_.assign(walls.size() * n_cells, 0.0);
+  for (std::size_t w = 0; w < walls.size(); ++w)
+#pragma omp parallel for num_threads(threads) schedule(static)
+    for (int c = 0; c < n_cells; ++c) {
+      double gap = std::numeric_limits<double>::infinity();
+      for (int i = cell_start_[c]; i < cell_start_[c + 1]; ++i) {
+        if (grains.wall[i] >= 0) continue;
+        const double g = nearest_point(walls[w], grains.x[i], box).distance - grains.r[i];
+        if (g >= 2 * skin_) gap = std::min(gap, g);
+      }
+      cell_wall_gap_[w * n_cells + c] = gap;
+    }
+}
+
+template <int dim>
+void Neighbours<dim>::arrange(int n, int threads) {
+  const int n_blocks = static_cast<int>(found_in_block_.size());
+  // Which blocks a block's pairs write to; two blocks that write to a common one need different colours.
+  std::vector<std::vector<int>> touches(n_blocks), touched_by(n_blocks);
+  std::vector<int> mark(n_blocks, -1);
+  for (int b = 0; b < n_blocks; ++b)
+    for (const Pair<dim>& pair : found_in_block_[b].pairs)
+      for (int t : {pair.i / block_size, pair.j / block_size})
+        if (mark[t] != b) mark[t] = b, touches[b].push_back(t), touched_by[t].push_back(b);
+  std::vector<int> colour(n_blocks, -1), taken;
+  int n_colours = 0;
+  for (int b = 0; b < n_blocks; ++b) {
+    taken.assign(n_colours + 1, 0);
+    for (int t : touches[b])
+      for (int other : touched_by[t])
+        if (colour[other] >= 0) taken[colour[other]] = 1;
+    colour[b] = static_cast<int>(std::find(taken.begin(), taken.end(), 0) - taken.begin());
+    n_colours = std::max(n_colours, colour[b] + 1);
+  }
+  const std::vector<int> order = sort_by_key(colour, n_colours, colours);
+  blocks.resize(n_blocks);
+  int total = 0;
+  for (int k = 0; k < n_blocks; ++k) {
+    const int size = static_cast<int>(found_in_block_[order[k]].pairs.size());
+    blocks[k] = {total, total + size};
+    total += size;
+  }
+  pairs.resize(total);
+#pragma omp parallel num_threads(threads)
+  {
+    std::vector<std::uint64_t> used(n, 0);  // colours of the pairs of a grain, in this block
+    std::vector<int> keys, start;
+#pragma omp for schedule(static)
+    for (int k = 0; k < n_blocks; ++k) {
+      const auto& found = found_in_block_[order[k]].pairs;
+      keys.clear();
+      for (const Pair<dim>& pair : found) {
+        const int c = std::min(std::countr_one(used[pair.i] | used[pair.j]), 63);
+        used[pair.i] |= std::uint64_t{1} << c;
+        used[pair.j] |= std::uint64_t{1} << c;
+        keys.push_back(c);
+      }
+      for (const Pair<dim>& pair : found) used[pair.i] = used[pair.j] = 0;
+      int at = blocks[k].begin;
+      for (int f : sort_by_key(keys, 64, start)) pairs[at++] = found[f];
+    }
+  }
+}
+
+template <int dim>
+void Neighbours<dim>::find(Grains<dim>& grains, std::vector<Wall<dim>>& walls, const Box<dim>& box, double skin,
+                           int threads) {
+  ++found;
+  skin_ = skin;
+  shifts.clear();
+  for (int code = 0; code <= shift_back<dim>(0); ++code) shifts.push_back(periodic_shift(box, code));
+  for (Wall<dim>& wall : walls) wall.moved.setZero();
+  const int n = grains.size();
+
+  sort(grains, box);
+  auto renumber = [&](int i) { return i < 0 ? i : new_of_old_[i]; };
+  const Known<dim, Pair<dim>> known(pairs, n, [&](Pair<dim>& old) {
+    old.i = renumber(old.i), old.j = renumber(old.j);
+    return old.i;
+  });
+  const Known<dim, WallPair<dim>> known_walls(wall_pairs, n, [&](WallPair<dim>& old) {
+    old.fixed = renumber(old.fixed), old.j = renumber(old.j);
+    return old.j;
+  });
+  list(grains, walls, box, threads);
+  arrange(n, threads);
+#pragma omp parallel for num_threads(threads) schedule(static)
+  for (std::size_t k = 0; k < pairs.size(); ++k)
+    pairs[k].p = known.find(pairs[k].i, [&](const Pair<dim>& old) { return old.j == pairs[k].j; });
+  wall_pairs.clear();
+  for (const Found& in_block : found_in_block_)
+    for (WallPair<dim> pair : in_block.wall_pairs) {
+      pair.p = known_walls.find(pair.j, [&](const WallPair<dim>& old) {
+        return old.wall == pair.wall && old.fixed == pair.fixed;
+      });
+      wall_pairs.push_back(pair);
+    }
+}
+
+template <int dim>
+bool Neighbours<dim>::valid(const Grains<dim>& grains, const std::vector<Wall<dim>>& walls, double reach, int threads) {
+  if (skin_ < 0) return false;
+  const int n_cells = static_cast<int>(cell_start_.size()) - 1;
+  cell_mean_.resize(n_cells);
+  cell_spread_.resize(n_cells);
+#pragma omp parallel for num_threads(threads) schedule(static)
+  for (int c = 0; c < n_cells; ++c) {
+    const int begin = cell_start_[c], end = cell_start_[c + 1];
+    Vec<dim> mean = Vec<dim>::Zero();
+    for (int i = begin; i < end; ++i) mean += grains.x[i] - x_found_[i];
+    if (end > begin) mean /= end - begin;
+    double spread2 = 0.0;
+    for (int i = begin; i < end; ++i) spread2 = std::max(spread2, (grains.x[i] - x_found_[i] - mean).squaredNorm());
+    cell_mean_[c] = mean;
+    cell_spread_[c] = std::sqrt(spread2);
+  }
+  // Neighbouring cells c < other, each once (twice where a period has two cells)
+  auto for_neighbours = [&](int c, auto&& visit) {
+    std::array<int, 3> at{0, 0, 0}, n{1, 1, 1};
+    for (int k = dim - 1, rest = c; k >= 0; --k) n[k] = cells_[k], at[k] = rest % n[k], rest /= n[k];
+    for (int code = 0; code <= shift_back<dim>(0); ++code) {
+      int other = 0;
+      bool outside = false;
+      for (int k = 0, f = dim == 2 ? 3 : 9; k < dim; ++k, f /= 3) {
+        int a = at[k] + code / f % 3 - 1;
+        if (around_[k]) a = (a + n[k]) % n[k];
+        outside |= a < 0 || a >= n[k];
+        other = other * n[k] + a;
+      }
+      if (!outside && other != c) visit(other);
+    }
+  };
+  // An empty cell may carry any value (the bound is a chain through neighbouring cells): its neighbours' mean costs least.
+  for (int c = 0; c < n_cells; ++c) {
+    if (cell_start_[c] != cell_start_[c + 1]) continue;
+    Vec<dim> mean = Vec<dim>::Zero();
+    int n = 0;
+    for_neighbours(c, [&](int other) {
+      if (cell_start_[other] != cell_start_[other + 1]) mean += cell_mean_[other], ++n;
+    });
+    if (n > 0) cell_mean_[c] = mean / n;
+  }
+  double nearing = 0.0;
+#pragma omp parallel for num_threads(threads) schedule(static) reduction(max : nearing)
+  for (int c = 0; c < n_cells; ++c) {
+    nearing = std::max(nearing, 2 * cell_spread_[c]);
+    for_neighbours(c, [&](int other) {
+      if (other < c) return;
+      nearing = std::max(nearing, cell_spread_[c] + cell_spread_[other] + (cell_mean_[c] - cell_mean_[other]).norm());
+    });
+  }
+  if (nearing + reach > skin_) return false;
+  for (std::size_t w = 0; w < walls.size(); ++w)
+    for (int c = 0; c < n_cells; ++c) {
+      const Vec<dim> way = cell_mean_[c] - walls[w].moved;
+      const double towards = walls[w].shape == Wall<dim>::Shape::plane ? -way.dot(walls[w].normal) : way.norm();
+      if (towards + cell_spread_[c] + reach > cell_wall_gap_[w * n_cells + c]) return false;
+    }
+  return true;
+}
+
+template class CloseGrains<2>;
+template class CloseGrains<3>;
+template class Neighbours<2>;
+template class Neighbours<3>;
+
+}  // namespace quicksand

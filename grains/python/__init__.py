@@ -1,0 +1,10 @@
+"""Grains by Non-Smooth Contact Dynamics: the compiled solver and its Python helpers.
+
+Holds nothing of its own. Importing it loads numpy and the compiled module only; scipy, matplotlib and
+tqdm are imported where they are used.
+"""
+
+from ._grains import *  # noqa: F403  Simulation, walls, StepReport
+from .packing import hexagonal_lattice, uniform_radii
+from .profiles import Profile, Profiles
+from .steady_state import BlockAverage, SteadyState, block_average, detect_steady_state, ratio_error

@@ -1,0 +1,58 @@
+"""Profiles across a cell whose walls move: sampled in bins of normalised height, averaged over any time window."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Time average across a cell; in bins without grains velocity and temperature are NaN."""
+
+    position: np.ndarray  # (bins,) centres of the bins, from the lower wall [m]
+    height: float  # mean height [m]
+    solid_fraction: np.ndarray  # (bins,) [-]
+    velocity: np.ndarray  # (bins, dim) mean over solid area or volume [m/s]
+    temperature: np.ndarray  # (bins, dim) <v^2> - <v>^2 per component, the shear across one grain included [m^2/s^2]
+
+    def shear_rate(self):
+        """Slope of <v_x> over the middle half of the height by least squares [1/s]; None with fewer than two bins."""
+        middle = (np.abs(self.position / self.height - 0.5) <= 0.25) & np.isfinite(self.velocity[:, 0])
+        if middle.sum() < 2:
+            return None
+        return float(np.polyfit(self.position[middle], self.velocity[middle, 0], 1)[0])
+
+
+class Profiles:
+    """Samples of `Simulation.profile`, kept until it is known which of them to average.
+
+    Parameters
+    ----------
+    axis : int
+        Axis across the cell.
+    bins : int
+    cross_section : float
+        Extent of the cell across `axis` [m in 2D, m^2 in 3D].
+    """
+
+    def __init__(self, axis, bins, cross_section):
+        self.axis, self.bins, self.cross_section = axis, bins, cross_section
+        self.samples = []  # (time, height, profile)
+
+    def sample(self, sim, low, high):
+        """Add the profile between `low` and `high` [m] as it is now."""
+        self.samples.append((sim.time, high - low, sim.profile(self.axis, low, high, self.bins)))
+
+    def mean(self, start):
+        """Average over the samples with time >= start [s], a `Profile`; None without samples, or where start is None."""
+        chosen = [(height, profile) for time, height, profile in self.samples if start is not None and time >= start]
+        if not chosen:
+            return None
+        heights = [height for height, _ in chosen]
+        solid, momentum, second = (sum(profile[name] for _, profile in chosen) for name in ("solid", "momentum", "second"))
+        height = float(np.mean(heights))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            velocity = momentum / solid[:, None]
+            temperature = second / solid[:, None] - velocity**2
+        volume = self.cross_section * sum(heights) / self.bins
+        return Profile((np.arange(self.bins) + 0.5) * height / self.bins, height, solid / volume, velocity, temperature)

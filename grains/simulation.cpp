@@ -1,0 +1,651 @@
+// The step. Reads as its own table of contents from step() on; building the scene comes before it.
+#include "simulation.hpp"
+
+#include <fmt/format.h>
+
+#include <stdexcept>
+
+namespace quicksand {
+
+namespace {
+
+template <class... Args>
+[[noreturn]] void fail(fmt::format_string<Args...> rule, Args&&... args) {
+  throw std::invalid_argument(fmt::format(rule, std::forward<Args>(args)...));
+}
+
+void check_finite(double value, const char* where, const char* what, std::size_t at) {
+  if (!std::isfinite(value)) fail("{}: {} must be finite, got {} (grain {})", where, what, value, at);
+}
+template <int n>
+void check_finite(const Vec<n>& value, const char* where, const char* what, std::size_t at) {
+  for (int k = 0; k < n; ++k) check_finite(value[k], where, what, at);
+}
+
+// Relative velocity of j seen from i, at the contact.
+template <int dim, class A>
+Vec<dim> relative_velocity(const A& a, const Body<dim>& b, const Vec<dim>& n) {
+  if constexpr (std::is_same_v<A, Body<dim>>)
+    return b.v - a.v - tangent_vector(n, Tangent<dim>(cross(Spin<dim>(a.s + b.s), n)));
+  else
+    return b.v - a - tangent_vector(n, Tangent<dim>(cross(b.s, n)));
+}
+
+}  // namespace
+
+std::uint8_t Materials::find(const std::string& name, const char* where) const {
+  const auto at = std::find(names_.begin(), names_.end(), name);
+  if (at == names_.end())
+    fail("{}: unknown material '{}'; set_friction names materials, known: {}", where, name,
+         names_.empty() ? "none" : fmt::format("{}", fmt::join(names_, ", ")));
+  return static_cast<std::uint8_t>(at - names_.begin());
+}
+
+std::uint8_t Materials::find_or_add(const std::string& name) {
+  const auto at = std::find(names_.begin(), names_.end(), name);
+  if (at != names_.end()) return static_cast<std::uint8_t>(at - names_.begin());
+  if (names_.size() == 255) fail("set_friction: at most 255 materials, '{}' is one more", name);
+  names_.push_back(name);
+  pairs_.resize(names_.size() * (names_.size() + 1) / 2);
+  return static_cast<std::uint8_t>(names_.size() - 1);
+}
+
+template <int dim>
+Simulation<dim>::Simulation(const Vec<dim>& period) {
+  for (int k = 0; k < dim; ++k)
+    if (!std::isfinite(period[k]) || period[k] < 0)
+      fail("Simulation: period must be > 0 m, or 0 along axes that are not periodic, got {} (axis {})", period[k], k);
+  box_.period = period;
+}
+
+template <int dim>
+int Simulation<dim>::add(std::span<const Vec<dim>> x, std::span<const double> radius, double density,
+                         std::span<const Vec<dim>> velocity, std::span<const Spin<dim>> omega, const std::string& material) {
+  const std::size_t n = x.size();
+  if (radius.size() != n) fail("add: one radius per grain, got {} for {} grains", radius.size(), n);
+  if (!velocity.empty() && velocity.size() != n) fail("add: one velocity per grain, got {} for {} grains", velocity.size(), n);
+  if (!omega.empty() && omega.size() != n) fail("add: one spin per grain, got {} for {} grains", omega.size(), n);
+  if (!(density > 0) || !std::isfinite(density)) fail("add: density must be > 0 kg/m^3, got {}", density);
+  const std::uint8_t m = materials_.find(material, "add");
+  for (std::size_t k = 0; k < n; ++k) {
+    if (!(radius[k] > 0) || !std::isfinite(radius[k])) fail("add: radius must be > 0 m, got {} (grain {})", radius[k], k);
+    for (int axis = 0; axis < dim; ++axis)
+      if (box_.period[axis] > 0 && box_.period[axis] < 8 * radius[k])
+        fail("add: a period must be at least four diameters, got {} m for radius {} m (grain {})", box_.period[axis],
+             radius[k], k);
+    check_finite(x[k], "add", "position [m]", k);
+    if (!velocity.empty()) check_finite(velocity[k], "add", "velocity [m/s]", k);
+    if (!omega.empty()) check_finite(std::sqrt(squared(omega[k])), "add", "spin [rad/s]", k);
+  }
+  const int first = n_free_;
+  for (std::size_t k = 0; k < n; ++k) {
+    Body<dim> body{};
+    body.v = velocity.empty() ? Vec<dim>::Zero() : velocity[k];
+    body.s = omega.empty() ? zero<Spin<dim>>() : Spin<dim>(radius[k] * omega[k]);
+    body.inv_m = 1.0 / (density * solid_volume<dim>(radius[k]));
+    grains_.x.push_back(x[k]);
+    grains_.body.push_back(body);
+    grains_.r.push_back(radius[k]);
+    grains_.id.push_back(n_free_++);
+    grains_.wall.push_back(-1);
+    grains_.material.push_back(m);
+  }
+  if (!grains_.force.empty()) grains_.force.resize(grains_.x.size(), Vec<dim>::Zero());
+  neighbours_.forget();
+  return first;
+}
+
+template <int dim>
+int Simulation<dim>::add_plane(const Vec<dim>& point, const Vec<dim>& normal, const std::string& material) {
+  if (!point.allFinite()) fail("add_plane: point [m] must be finite");
+  if (!normal.allFinite() || !(normal.norm() > 0)) fail("add_plane: normal must be finite and not zero");
+  Wall<dim> wall;
+  wall.point = point;
+  wall.normal = normal.normalized();
+  wall.material = materials_.find(material, "add_plane");
+  walls_.push_back(wall);
+  neighbours_.forget();
+  return static_cast<int>(walls_.size()) - 1;
+}
+
+template <int dim>
+int Simulation<dim>::add_segment(const Vec<dim>& start, const Vec<dim>& end, const std::string& material) {
+  if (dim != 2) fail("add_segment: segments are walls of 2D scenes");
+  if (!start.allFinite() || !end.allFinite() || !((end - start).norm() > 0))
+    fail("add_segment: start and end [m] must be finite and apart");
+  Wall<dim> wall;
+  wall.shape = Wall<dim>::Shape::segment;
+  wall.point = start;
+  wall.span = end - start;
+  wall.material = materials_.find(material, "add_segment");
+  walls_.push_back(wall);
+  neighbours_.forget();
+  return static_cast<int>(walls_.size()) - 1;
+}
+
+template <int dim>
+void Simulation<dim>::check_wall(int wall, const char* where) const {
+  if (wall < 0 || wall >= static_cast<int>(walls_.size()))
+    fail("{}: no wall {}, the scene has {}", where, wall, walls_.size());
+}
+
+template <int dim>
+void Simulation<dim>::drive(int wall, int axis, double velocity) {
+  check_wall(wall, "drive");
+  if (!std::isfinite(velocity)) fail("drive: velocity must be finite, got {} m/s (wall {}, axis {})", velocity, wall, axis);
+  walls_[wall].loaded[axis] = false;
+  walls_[wall].inv_m[axis] = walls_[wall].load[axis] = 0.0;
+  walls_[wall].v[axis] = velocity;
+}
+
+template <int dim>
+void Simulation<dim>::load(int wall, int axis, double force, std::optional<double> mass) {
+  check_wall(wall, "load");
+  if (!std::isfinite(force)) fail("load: load must be finite, got {} N (wall {}, axis {})", force, wall, axis);
+  if (mass && (!(*mass > 0) || !std::isfinite(*mass))) fail("load: mass must be > 0 kg, got {} (wall {})", *mass, wall);
+  walls_[wall].loaded[axis] = true;
+  walls_[wall].load[axis] = force;
+  if (mass) walls_[wall].mass = *mass;
+}
+
+template <int dim>
+void Simulation<dim>::attach(int wall, std::span<const Vec<dim>> x, std::span<const double> radius,
+                             const std::string& material) {
+  check_wall(wall, "attach");
+  if (radius.size() != x.size()) fail("attach: one radius per grain, got {} for {} grains", radius.size(), x.size());
+  const std::uint8_t m = materials_.find(material, "attach");
+  for (std::size_t k = 0; k < x.size(); ++k) {
+    if (!(radius[k] > 0) || !std::isfinite(radius[k])) fail("attach: radius must be > 0 m, got {} (grain {})", radius[k], k);
+    check_finite(x[k], "attach", "position [m]", k);
+  }
+  for (std::size_t k = 0; k < x.size(); ++k) {
+    Body<dim> body{};
+    body.v = walls_[wall].v;
+    body.s = zero<Spin<dim>>();
+    grains_.x.push_back(x[k]);
+    grains_.body.push_back(body);
+    grains_.r.push_back(radius[k]);
+    grains_.id.push_back(-(++n_fixed_));
+    grains_.wall.push_back(static_cast<std::int16_t>(wall));
+    grains_.material.push_back(m);
+  }
+  if (!grains_.force.empty()) grains_.force.resize(grains_.x.size(), Vec<dim>::Zero());
+  neighbours_.forget();
+}
+
+template <int dim>
+void Simulation<dim>::set_friction(const std::string& a, const std::string& b, double friction) {
+  if (!(friction >= 0) || !std::isfinite(friction)) fail("set_friction: friction must be >= 0, got {} ('{}' on '{}')", friction, a, b);
+  const int i = materials_.find_or_add(a), j = materials_.find_or_add(b);
+  materials_.pair(i, j).friction = friction;
+}
+
+template <int dim>
+void Simulation<dim>::set_restitution(const std::string& a, const std::string& b, double normal, double tangential) {
+  if (!(normal >= 0 && normal <= 1)) fail("set_restitution: normal restitution must be in [0, 1], got {}", normal);
+  if (!(tangential >= 0 && tangential <= 1))
+    fail("set_restitution: tangential restitution must be in [0, 1], got {}", tangential);
+  Materials::Pair& pair = materials_.pair(materials_.find(a, "set_restitution"), materials_.find(b, "set_restitution"));
+  pair.normal = normal;
+  pair.tangential = tangential;
+}
+
+template <int dim>
+void Simulation<dim>::set_inertia(double ratio) {
+  if (!(ratio > 0 && ratio <= 1)) fail("set_inertia: I/(m r^2) must be in (0, 1], got {}", ratio);
+  grains_.inertia = ratio;
+}
+
+template <int dim>
+void Simulation<dim>::set_by_id(std::size_t size, const char* where, const char* what) const {
+  if (size != static_cast<std::size_t>(n_free_)) fail("{}: one {} per grain, got {} for {} grains", where, what, size, n_free_);
+}
+
+template <int dim>
+void Simulation<dim>::set_force(std::span<const Vec<dim>> force) {
+  if (force.empty()) return grains_.force.clear();
+  set_by_id(force.size(), "set_force", "force");
+  for (std::size_t k = 0; k < force.size(); ++k) check_finite(force[k], "set_force", "force [N]", k);
+  grains_.force.assign(grains_.x.size(), Vec<dim>::Zero());
+  for (int k = 0; k < grains_.size(); ++k)
+    if (grains_.id[k] >= 0) grains_.force[k] = force[grains_.id[k]];
+}
+
+template <int dim>
+void Simulation<dim>::set_position(std::span<const Vec<dim>> x) {
+  set_by_id(x.size(), "set_position", "position");
+  for (std::size_t k = 0; k < x.size(); ++k) check_finite(x[k], "set_position", "position [m]", k);
+  for (int k = 0; k < grains_.size(); ++k)
+    if (grains_.id[k] >= 0) grains_.x[k] = x[grains_.id[k]];
+  neighbours_.forget();
+}
+
+template <int dim>
+void Simulation<dim>::set_velocity(std::span<const Vec<dim>> v) {
+  set_by_id(v.size(), "set_velocity", "velocity");
+  for (std::size_t k = 0; k < v.size(); ++k) check_finite(v[k], "set_velocity", "velocity [m/s]", k);
+  for (int k = 0; k < grains_.size(); ++k)
+    if (grains_.id[k] >= 0) grains_.body[k].v = v[grains_.id[k]];
+}
+
+template <int dim>
+void Simulation<dim>::set_omega(std::span<const Spin<dim>> omega) {
+  set_by_id(omega.size(), "set_omega", "spin");
+  for (std::size_t k = 0; k < omega.size(); ++k)
+    check_finite(std::sqrt(squared(omega[k])), "set_omega", "spin [rad/s]", k);
+  for (int k = 0; k < grains_.size(); ++k)
+    if (grains_.id[k] >= 0) grains_.body[k].s = grains_.r[k] * omega[grains_.id[k]];
+}
+
+// ---------------------------------------------------------------------------------------------------------------- the step
+
+template <int dim>
+StepReport<dim> Simulation<dim>::step(double dt) {
+  if (!(dt > 0) || !std::isfinite(dt)) fail("step: dt must be > 0 s, got {}", dt);
+  prepare();
+  StepReport<dim> report;
+  report.dt = dt;
+  for (Wall<dim>& wall : walls_) wall.force.setZero();
+
+  for (double left = dt; left > 0;) {
+    Motion motion = measure_pairs();
+    double h = sub_step_length(left, dt, motion);
+    // Approach of a pair in this sub-step; half as much again, for a grain may be pushed faster than any moved before.
+    auto alert = [&] { return 1.5 * h * (motion.speed + h * acceleration_) + 0.01 * mean_radius_; };
+    if (!neighbours_.valid(grains_, walls_, alert(), threads_)) {
+      neighbours_.find(grains_, walls_, box_, std::max(0.5 * mean_radius_, 3 * alert()), threads_);
+      motion = measure_pairs();
+      h = sub_step_length(left, dt, motion);
+    }
+    body_before_ = grains_.body;
+    for (std::size_t w = 0; w < walls_.size(); ++w) wall_before_[w] = walls_[w].v;
+
+    accelerate(h);
+    find_contacts(h, alert());
+    const SolveReport solved = solve_contacts(h);
+    account(h, report);
+    move(h);
+
+    left = h < left ? left - h : 0.0;
+    time_ += h;
+    ++report.sub_steps;
+    report.sweeps += solved.sweeps;
+    report.updates += solved.updates;
+    report.residual = std::max(report.residual, solved.residual);
+    report.worst_contact = std::max(report.worst_contact, h * solved.worst);
+    report.max_overlap = std::max(report.max_overlap, motion.overlap);
+    report.unconverged += !solved.converged;
+    if (!solved.converged && !settings.accept_unconverged)
+      throw NotConverged(fmt::format(
+          "step: residual {:.2e} above the tolerance {:.2e} after {} sweeps at t = {:.6g} s; raise max_sweeps or the "
+          "tolerance, or accept such steps with accept_unconverged (they are counted)",
+          solved.residual, settings.solve.tolerance, solved.sweeps, time_));
+  }
+
+  report.time = time_;
+  report.candidates /= report.sub_steps;
+  if (report.contacts > 0) report.branch_length /= static_cast<double>(report.contacts);
+  report.coordination = n_free_ > 0 ? 2.0 * report.contacts / (double(report.sub_steps) * n_free_) : 0.0;
+  report.contacts /= report.sub_steps;
+  report.virial_contacts /= dt;
+  report.virial_wall_contacts /= dt;
+  for (Wall<dim>& wall : walls_) wall.force /= dt;
+  for (const Body<dim>& b : grains_.body) {
+    if (b.inv_m == 0) continue;
+    report.virial_kinetic += b.v * b.v.transpose() / b.inv_m;
+  }
+  return report;
+}
+
+// Checks of the scene that adding things one by one cannot make, and what depends on the scene but not on the sub-step.
+template <int dim>
+void Simulation<dim>::prepare() {
+  const int n = grains_.size();
+  double mass = 0.0, r_sum = 0.0;
+  std::vector<char> used(materials_.names().size(), 0), grain(used.size(), 0);
+  acceleration_ = 0.0;
+  for (int k = 0; k < n; ++k) {
+    r_sum += grains_.r[k];
+    if (grains_.body[k].inv_m > 0) mass += 1.0 / grains_.body[k].inv_m;
+    if (!grains_.force.empty()) acceleration_ = std::max(acceleration_, grains_.force[k].norm() * grains_.body[k].inv_m);
+    used[grains_.material[k]] = 1;
+    if (grains_.id[k] >= 0) grain[grains_.material[k]] = 1;
+  }
+  acceleration_ += gravity.norm();
+  mean_radius_ = n > 0 ? r_sum / n : 0.0;
+  double wall_acceleration = 0.0;
+  for (Wall<dim>& wall : walls_) {
+    used[wall.material] = 1;
+    for (int k = 0; k < dim; ++k) {
+      if (!wall.loaded[k]) continue;
+      if (wall.mass == 0.0 && mass > 0.0) wall.mass = 0.1 * mass;
+      if (wall.mass == 0.0) fail("step: a load-driven wall needs a mass where there are no grains");
+      wall.inv_m[k] = 1.0 / wall.mass;
+      wall_acceleration = std::max(wall_acceleration, std::abs(wall.load[k]) * wall.inv_m[k]);
+    }
+  }
+  acceleration_ += wall_acceleration;
+  friction_ = restitution_ = tangential_restitution_ = false;
+  for (std::size_t a = 0; a < used.size(); ++a)
+    for (std::size_t b = 0; b < used.size(); ++b) {
+      if (!grain[a] || !used[b]) continue;
+      const Materials::Pair& pair = materials_.pair(a, b);
+      if (pair.friction < 0)
+        fail("step: no friction set between '{}' and '{}'; call set_friction", materials_.names()[a], materials_.names()[b]);
+      friction_ |= pair.friction > 0;
+      restitution_ |= pair.normal > 0 || pair.tangential > 0;
+      tangential_restitution_ |= pair.tangential > 0;
+    }
+  wall_before_.resize(walls_.size());
+  threads_ = std::clamp(n / 1000, 1, settings.threads);  // fewer grains than that are not worth a second thread
+}
+
+// Gaps of all listed pairs, and how fast they move relative to each other.
+template <int dim>
+typename Simulation<dim>::Motion Simulation<dim>::measure_pairs() {
+  const auto& pairs = neighbours_.pairs;
+  const auto& wall_pairs = neighbours_.wall_pairs;
+  const int n = static_cast<int>(pairs.size()), n_walls = static_cast<int>(wall_pairs.size());
+  gap_.resize(n + n_walls);
+  double speed2 = 0.0, rate2 = 0.0, least = 0.0;
+#pragma omp parallel for num_threads(threads_) schedule(static) reduction(max : speed2, rate2) reduction(min : least)
+  for (int k = 0; k < n; ++k) {
+    const Pair<dim>& pair = pairs[k];
+    const Vec<dim> branch = grains_.x[pair.j] - grains_.x[pair.i] + neighbours_.shifts[pair.shift];
+    const double reach = grains_.r[pair.i] + grains_.r[pair.j];
+    gap_[k] = branch.norm() - reach;
+    const double u2 = (grains_.body[pair.j].v - grains_.body[pair.i].v).squaredNorm();
+    least = std::min(least, gap_[k]);
+    speed2 = std::max(speed2, u2);
+    rate2 = std::max(rate2, u2 / (reach * reach));
+  }
+  Motion motion{std::sqrt(speed2), std::sqrt(rate2), -least};
+  for (int k = 0; k < n_walls; ++k) {
+    const WallPair<dim>& pair = wall_pairs[k];
+    const Wall<dim>& wall = walls_[pair.wall];
+    const Vec<dim> u = grains_.body[pair.j].v - wall.v;
+    const double r = grains_.r[pair.j];
+    double gap = 0.0, speed = u.norm();
+    if (pair.fixed >= 0) {
+      const double reach = r + grains_.r[pair.fixed];
+      gap = (grains_.x[pair.j] - grains_.x[pair.fixed] + neighbours_.shifts[pair.shift]).norm() - reach;
+      motion.rate = std::max(motion.rate, speed / reach);
+    } else {
+      const NearWall<dim> near = nearest_point(wall, grains_.x[pair.j], box_);
+      gap = near.distance - r;
+      if (wall.shape == Wall<dim>::Shape::plane) speed = std::abs(u.dot(near.n));  // the gap to a plane is linear: any step
+      else motion.rate = std::max(motion.rate, 0.5 * speed / r);
+    }
+    gap_[n + k] = gap;
+    motion.speed = std::max(motion.speed, speed);
+    motion.overlap = std::max(motion.overlap, -gap);
+  }
+  return motion;
+}
+
+// The linearised gap underestimates the gap of convex bodies that slide past each other, by (u_t h)^2/(2 d): a sub-step that
+// lets a pair move by a fraction f of its centres' distance opens gaps of f^2/2 of it, and never makes an overlap.
+template <int dim>
+double Simulation<dim>::sub_step_length(double left, double dt, const Motion& motion) const {
+  double parts = 1.0;
+  if (settings.sub_steps == SubSteps::relative) {
+    const double rate = motion.rate + left * acceleration_ / (2 * std::max(mean_radius_, 1e-300));
+    parts = std::ceil(left * rate / settings.sub_step_motion);
+  } else {
+    double v2_max = 0.0, r_min = std::numeric_limits<double>::infinity();
+    for (int k = 0; k < grains_.size(); ++k)
+      v2_max = std::max(v2_max, grains_.body[k].v.squaredNorm()), r_min = std::min(r_min, grains_.r[k]);
+    parts = std::round(left / dt * std::max(1.0, std::ceil(8 * std::sqrt(v2_max) * dt / r_min)));
+  }
+  return left / std::max(parts, 1.0);
+}
+
+template <int dim>
+void Simulation<dim>::accelerate(double h) {
+  const int n = grains_.size();
+  if (!gravity.isZero(0.0) || !grains_.force.empty()) {
+    const bool forced = !grains_.force.empty();
+#pragma omp parallel for num_threads(threads_) schedule(static)
+    for (int k = 0; k < n; ++k) {
+      Body<dim>& b = grains_.body[k];
+      if (b.inv_m == 0) continue;
+      b.v += h * gravity;
+      if (forced) b.v += h * b.inv_m * grains_.force[k];
+    }
+  }
+  for (Wall<dim>& wall : walls_) wall.v += h * wall.inv_m.cwiseProduct(wall.load);
+}
+
+// Pairs nearer than `alert` become contacts, with the impulse of the last sub-step, scaled to the length of this one.
+template <int dim>
+void Simulation<dim>::find_contacts(double h, double alert) {
+  const int n = static_cast<int>(neighbours_.pairs.size()), n_blocks = static_cast<int>(neighbours_.blocks.size());
+  contacts_.resize(n);
+  active_.resize(n);
+  count_.resize(n_blocks);
+  active_count_.resize(n_blocks);
+  const double scale = last_h_ > 0 ? h / last_h_ : 0.0;
+  last_h_ = h;
+#pragma omp parallel for num_threads(threads_) schedule(static)
+  for (int b = 0; b < n_blocks; ++b) {
+    int at = neighbours_.blocks[b].begin;
+    for (int k = neighbours_.blocks[b].begin; k < neighbours_.blocks[b].end; ++k) {
+      Pair<dim>& pair = neighbours_.pairs[k];
+      if (gap_[k] >= alert) {
+        pair.p = {};
+        continue;
+      }
+      Contact<dim>& c = contacts_[at++];
+      const Vec<dim> branch = grains_.x[pair.j] - grains_.x[pair.i] + neighbours_.shifts[pair.shift];
+      c.n = branch / branch.norm();
+      c.bias = std::max(gap_[k], 0.0) / h;
+      c.inv_w = 1.0 / (grains_.body[pair.i].inv_m + grains_.body[pair.j].inv_m);
+      c.friction = materials_.pair(grains_.material[pair.i], grains_.material[pair.j]).friction;
+      c.p = {scale * pair.p.n, scale * onto_plane(pair.p.t, c.n)};
+      c.i = pair.i;
+      c.j = pair.j;
+      c.pair = k;
+    }
+    count_[b] = at - neighbours_.blocks[b].begin;
+  }
+  wall_contacts_.clear();
+  for (std::size_t k = 0; k < neighbours_.wall_pairs.size(); ++k) {
+    WallPair<dim>& pair = neighbours_.wall_pairs[k];
+    if (gap_[n + k] >= alert) {
+      pair.p = {};
+      continue;
+    }
+    const Wall<dim>& wall = walls_[pair.wall];
+    const Body<dim>& body = grains_.body[pair.j];
+    WallContact<dim> c{};
+    std::uint8_t material = wall.material;
+    if (pair.fixed >= 0) {
+      const Vec<dim> branch = grains_.x[pair.j] - grains_.x[pair.fixed] + neighbours_.shifts[pair.shift];
+      c.n = branch / branch.norm();
+      material = grains_.material[pair.fixed];
+    } else {
+      c.n = nearest_point(wall, grains_.x[pair.j], box_).n;
+    }
+    c.bias = std::max(gap_[n + k], 0.0) / h;
+    c.inv_w = 1.0 / (body.inv_m + c.n.cwiseProduct(wall.inv_m).dot(c.n));
+    c.inv_w_t = 1.0 / (body.inv_m * (1 + 1 / grains_.inertia) + wall.inv_m.maxCoeff());
+    if constexpr (dim == 2)
+      c.inv_w_t = 1.0 / (body.inv_m * (1 + 1 / grains_.inertia) + c.n.y() * c.n.y() * wall.inv_m.x() + c.n.x() * c.n.x() * wall.inv_m.y());
+    c.friction = materials_.pair(material, grains_.material[pair.j]).friction;
+    c.p = {scale * pair.p.n, scale * onto_plane(pair.p.t, c.n)};
+    c.wall = pair.wall;
+    c.j = pair.j;
+    c.pair = static_cast<int>(k);
+    wall_contacts_.push_back(c);
+  }
+}
+
+template <int dim>
+SolveReport Simulation<dim>::solve_contacts(double) {
+  Problem<dim> problem{grains_.body,   walls_,  neighbours_.blocks,     neighbours_.colours, count_,    contacts_,
+                       wall_contacts_, {},      {},                     active_,             active_count_,
+                       1.0 / grains_.inertia,   friction_,              threads_};
+  auto solve = settings.solver == Solver::nlgs ? solve_nlgs<dim> : solve_active_set<dim>;
+  warm_start(problem);
+  SolveReport report = solve(problem, settings.solve);
+  if (restitution_ && rebound()) {
+    if (tangential_restitution_) problem.bias_t = bias_t_, problem.wall_bias_t = wall_bias_t_;
+    const SolveReport second = solve(problem, settings.solve);
+    report = {report.sweeps + second.sweeps, report.updates + second.updates, second.residual, second.worst, second.converged};
+  }
+#pragma omp parallel for num_threads(threads_) schedule(static)
+  for (int b = 0; b < static_cast<int>(count_.size()); ++b)
+    for (int k = neighbours_.blocks[b].begin; k < neighbours_.blocks[b].begin + count_[b]; ++k)
+      neighbours_.pairs[contacts_[k].pair].p = contacts_[k].p;
+  for (const WallContact<dim>& c : wall_contacts_) neighbours_.wall_pairs[c.pair].p = c.p;
+  return report;
+}
+
+// Newton's law for contacts that would close in this sub-step and approach faster than the rest speed:
+//   0 <= u_n + e u_n^-  perp  p_n >= 0,  without the gap term;  u_t + e_t u_t^- in the place of u_t.
+// Returns whether any contact rebounds.
+template <int dim>
+bool Simulation<dim>::rebound() {
+  bool any = false;
+  if (tangential_restitution_) {
+    bias_t_.assign(contacts_.size(), zero<Tangent<dim>>());
+    wall_bias_t_.assign(wall_contacts_.size(), zero<Tangent<dim>>());
+  }
+  auto apply = [&](auto& c, const Materials::Pair& law, const Vec<dim>& u, std::vector<Tangent<dim>>& bias_t, std::size_t k) {
+    const double u_n = u.dot(c.n);
+    if (c.p.n <= 0 || u_n >= -settings.rest_speed || (law.normal == 0 && law.tangential == 0)) return;
+    c.bias = law.normal * u_n;
+    if (tangential_restitution_) bias_t[k] = law.tangential * tangential(u, c.n);
+    any = true;
+  };
+  for (std::size_t b = 0; b < count_.size(); ++b)
+    for (int k = neighbours_.blocks[b].begin; k < neighbours_.blocks[b].begin + count_[b]; ++k) {
+      Contact<dim>& c = contacts_[k];
+      apply(c, materials_.pair(grains_.material[c.i], grains_.material[c.j]),
+            relative_velocity(body_before_[c.i], body_before_[c.j], c.n), bias_t_, k);
+    }
+  for (std::size_t k = 0; k < wall_contacts_.size(); ++k) {
+    WallContact<dim>& c = wall_contacts_[k];
+    const int fixed = neighbours_.wall_pairs[c.pair].fixed;
+    apply(c, materials_.pair(fixed >= 0 ? grains_.material[fixed] : walls_[c.wall].material, grains_.material[c.j]),
+          relative_velocity(wall_before_[c.wall], body_before_[c.j], c.n), wall_bias_t_, k);
+  }
+  return any;
+}
+
+// Work, dissipation and stress of the sub-step. With p the impulse of a contact and u its relative velocity, the change of kinetic
+// energy is exactly the sum of p.(u before + u after)/2 plus the work of what acts from outside.
+template <int dim>
+void Simulation<dim>::account(double h, StepReport<dim>& report) {
+  const int n_blocks = static_cast<int>(neighbours_.blocks.size());
+  sums_.resize(n_blocks);
+#pragma omp parallel for num_threads(threads_) schedule(static)
+  for (int b = 0; b < n_blocks; ++b) {
+    Sums sums;
+    const int begin = neighbours_.blocks[b].begin;
+    for (int k = begin; k < begin + count_[b]; ++k) {
+      const Contact<dim>& c = contacts_[k];
+      if (c.p.n <= 0) continue;
+      const Vec<dim> p = c.p.n * c.n + tangent_vector(c.n, c.p.t);
+      const Vec<dim> u = relative_velocity(body_before_[c.i], body_before_[c.j], c.n) +
+                         relative_velocity(grains_.body[c.i], grains_.body[c.j], c.n);
+      const double branch = grains_.r[c.i] + grains_.r[c.j] + gap_[c.pair];
+      sums.power += 0.5 * p.dot(u);
+      sums.branch += branch;
+      sums.virial += p * (branch * c.n).transpose();
+      ++sums.contacts;
+    }
+    sums.candidates = count_[b];
+    sums_[b] = sums;
+  }
+  double power = 0.0;
+  for (const Sums& s : sums_) {
+    power += s.power;
+    report.branch_length += s.branch;
+    report.contacts += s.contacts;
+    report.candidates += s.candidates;
+    report.virial_contacts += s.virial;
+  }
+  report.candidates += static_cast<long>(wall_contacts_.size());
+  double work_walls = 0.0, work_forces = 0.0, kinetic = 0.0, kinetic_before = 0.0;
+  for (const WallContact<dim>& c : wall_contacts_) {
+    if (c.p.n <= 0) continue;
+    const Vec<dim> p = c.p.n * c.n + tangent_vector(c.n, c.p.t);
+    Wall<dim>& wall = walls_[c.wall];
+    const Vec<dim> u = relative_velocity(wall_before_[c.wall], body_before_[c.j], c.n) +
+                       relative_velocity(wall.v, grains_.body[c.j], c.n);
+    power += 0.5 * p.dot(u);
+    wall.force -= p;
+    for (int k = 0; k < dim; ++k)
+      if (wall.inv_m[k] == 0) work_walls += p[k] * wall.v[k];
+    report.virial_wall_contacts += p * (grains_.r[c.j] * c.n).transpose();
+  }
+  for (std::size_t w = 0; w < walls_.size(); ++w)
+    for (int k = 0; k < dim; ++k) {
+      if (walls_[w].inv_m[k] == 0) continue;
+      const double before = wall_before_[w][k], after = walls_[w].v[k];
+      work_walls += h * walls_[w].load[k] * 0.5 * (before + after);
+      kinetic += 0.5 * after * after / walls_[w].inv_m[k];
+      kinetic_before += 0.5 * before * before / walls_[w].inv_m[k];
+    }
+  const bool pulled = !gravity.isZero(0.0), forced = !grains_.force.empty();
+  for (int k = 0; k < grains_.size(); ++k) {
+    const Body<dim>&before = body_before_[k], &after = grains_.body[k];
+    if (after.inv_m == 0) continue;
+    const double m = 1.0 / after.inv_m;
+    kinetic += 0.5 * m * (after.v.squaredNorm() + grains_.inertia * squared(after.s));
+    kinetic_before += 0.5 * m * (before.v.squaredNorm() + grains_.inertia * squared(before.s));
+    if (!pulled && !forced) continue;
+    Vec<dim> f = m * gravity;
+    if (forced) f += grains_.force[k];
+    work_forces += 0.5 * h * f.dot(before.v + after.v);
+  }
+  report.kinetic_energy = kinetic;
+  report.work_walls += work_walls;
+  report.work_forces += work_forces;
+  report.dissipation -= power;
+  report.energy_balance_error += kinetic - kinetic_before - work_walls - work_forces - power;
+}
+
+template <int dim>
+void Simulation<dim>::move(double h) {
+  const int n = grains_.size();
+  for (Wall<dim>& wall : walls_) wall.point += h * wall.v, wall.moved += h * wall.v;
+#pragma omp parallel for num_threads(threads_) schedule(static)
+  for (int k = 0; k < n; ++k) {
+    if (grains_.wall[k] >= 0) grains_.body[k].v = walls_[grains_.wall[k]].v;
+    grains_.x[k] += h * grains_.body[k].v;
+  }
+}
+
+template <int dim>
+ContactList<dim> Simulation<dim>::contacts() const {
+  ContactList<dim> list;
+  auto push = [&](std::int64_t i, int j, const auto& c) {
+    list.i.push_back(i);
+    list.j.push_back(grains_.id[j]);
+    list.normal.push_back(c.n);
+    list.point.push_back(box_.wrap(grains_.x[j] - grains_.r[j] * c.n));
+    list.force_normal.push_back(c.p.n / last_h_);
+    list.force_tangential.push_back(tangent_vector(c.n, c.p.t) / last_h_);
+  };
+  for (std::size_t b = 0; b < count_.size(); ++b)
+    for (int k = neighbours_.blocks[b].begin; k < neighbours_.blocks[b].begin + count_[b]; ++k)
+      if (contacts_[k].p.n > 0) push(grains_.id[contacts_[k].i], contacts_[k].j, contacts_[k]);
+  for (const WallContact<dim>& c : wall_contacts_)
+    if (c.p.n > 0) push(-1 - c.wall, c.j, c);
+  return list;
+}
+
+template <int dim>
+std::size_t Simulation<dim>::memory() const {
+  auto bytes = [](const auto& v) { return v.capacity() * sizeof(v[0]); };
+  return bytes(grains_.x) + bytes(grains_.body) + bytes(grains_.r) + bytes(grains_.id) + bytes(grains_.wall) +
+         bytes(grains_.material) + bytes(grains_.force) + bytes(neighbours_.pairs) + bytes(neighbours_.wall_pairs) +
+         bytes(gap_) + bytes(contacts_) + bytes(wall_contacts_) + bytes(active_) + bytes(body_before_) + bytes(bias_t_);
+}
+
+template class Simulation<2>;
+template class Simulation<3>;
+
+}  // namespace quicksand

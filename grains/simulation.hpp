@@ -1,0 +1,161 @@
+// Non-Smooth Contact Dynamics of a scene: the Moreau-Jean step, first order, and the report every step gives of itself.
+#pragma once
+
+#include "grains.hpp"
+#include "neighbours.hpp"
+#include "solvers.hpp"
+
+#include <optional>
+
+namespace quicksand {
+
+enum class Solver { nlgs, active_set };
+
+enum class SubSteps {
+  relative,  // motion of a pair relative to each other, in a sub-step, below `sub_step_motion` of the distance of their centres
+  absolute,  // ceil(8 v_max dt/r_min): the rule of the MigFlow thesis, from speeds in the frame of the box
+};
+
+struct Settings {
+  Solver solver = Solver::active_set;
+  SolverSettings solve;
+  SubSteps sub_steps = SubSteps::relative;
+  double sub_step_motion = 0.1;     // [-]
+  double rest_speed = 0.0;          // contacts that approach more slowly do not rebound [m/s]
+  bool accept_unconverged = false;  // false: a step that misses its tolerance throws NotConverged
+  int threads = 1;
+};
+
+// A sub-step missed its tolerance after all sweeps and the fallback. The scene has taken the sub-step all the same.
+struct NotConverged : std::runtime_error {
+  using std::runtime_error::runtime_error;
+};
+
+template <int dim>
+struct StepReport {
+  double time = 0.0;              // at the end [s]
+  double dt = 0.0;                // [s]
+  int sub_steps = 0;
+  int sweeps = 0;                 // of all sub-steps
+  long updates = 0;               // contacts visited in them
+  long candidates = 0;            // contacts within the alert distance, mean over sub-steps
+  long contacts = 0;              // of these load-bearing, mean over sub-steps
+  double residual = 0.0;          // largest of the sub-steps [-]
+  double worst_contact = 0.0;     // largest h W_nn |e| of one contact [m]
+  double max_overlap = 0.0;       // at the starts of the sub-steps [m]
+  int unconverged = 0;            // sub-steps accepted above the tolerance
+  double work_walls = 0.0;        // by driven walls and by loads [J] (2D: J/m, as all energies)
+  double work_forces = 0.0;       // by gravity and external forces [J]
+  double dissipation = 0.0;       // in contacts [J]
+  double kinetic_energy = 0.0;    // at the end, load-driven walls included [J]
+  double energy_balance_error = 0.0;  // change of kinetic energy - work + dissipation [J]
+  Mat<dim> virial_contacts = Mat<dim>::Zero();       // sum over grain contacts of force x branch, mean over dt [J]
+  Mat<dim> virial_wall_contacts = Mat<dim>::Zero();  // the same between walls and the grains they touch
+  Mat<dim> virial_kinetic = Mat<dim>::Zero();        // sum of m v x v at the end, in the frame of the box [J]
+  double branch_length = 0.0;     // mean over load-bearing grain contacts [m]; 0: none
+  double coordination = 0.0;      // 2 contacts between grains / grains [-]
+};
+
+// Load-bearing contacts of the last sub-step, for output.
+template <int dim>
+struct ContactList {
+  std::vector<std::int64_t> i, j;   // ids; wall w is -1 - w and always i
+  std::vector<Vec<dim>> normal;     // from i to j
+  std::vector<Vec<dim>> point;      // [m]
+  std::vector<double> force_normal; // [N] (2D: N/m)
+  std::vector<Vec<dim>> force_tangential;  // on j [N]
+};
+
+template <int dim>
+class Simulation {
+ public:
+  explicit Simulation(const Vec<dim>& period);
+
+  Settings settings;
+  Vec<dim> gravity = Vec<dim>::Zero();  // [m/s^2]
+
+  // Each returns the id of the first grain, or the number of the wall. All throw std::invalid_argument on what cannot be.
+  int add(std::span<const Vec<dim>> x, std::span<const double> radius, double density, std::span<const Vec<dim>> velocity,
+          std::span<const Spin<dim>> omega, const std::string& material);
+  int add_plane(const Vec<dim>& point, const Vec<dim>& normal, const std::string& material);
+  int add_segment(const Vec<dim>& start, const Vec<dim>& end, const std::string& material);
+  void drive(int wall, int axis, double velocity);                            // [m/s]
+  void load(int wall, int axis, double force, std::optional<double> mass);    // [N], [kg]
+  void attach(int wall, std::span<const Vec<dim>> x, std::span<const double> radius, const std::string& material);
+  void set_friction(const std::string& a, const std::string& b, double friction);
+  void set_restitution(const std::string& a, const std::string& b, double normal, double tangential);
+  void set_inertia(double ratio);                                             // I/(m r^2) [-]
+  void set_force(std::span<const Vec<dim>> force);                            // by id [N]; empty: none
+
+  StepReport<dim> step(double dt);
+
+  int count() const { return n_free_; }
+  double time() const { return time_; }
+  const Box<dim>& box() const { return box_; }
+  const Grains<dim>& grains() const { return grains_; }
+  const std::vector<Wall<dim>>& walls() const { return walls_; }
+  const Neighbours<dim>& neighbours() const { return neighbours_; }
+  std::size_t memory() const;  // bytes held in arrays that grow with the number of grains
+  ContactList<dim> contacts() const;
+
+  // State by id; for changes from outside between steps.
+  template <class Get>
+  auto by_id(Get&& get) const {
+    std::vector<std::decay_t<decltype(get(grains_, 0))>> out(n_free_);
+    for (int k = 0; k < grains_.size(); ++k)
+      if (grains_.id[k] >= 0) out[grains_.id[k]] = get(grains_, k);
+    return out;
+  }
+  void set_position(std::span<const Vec<dim>> x);
+  void set_velocity(std::span<const Vec<dim>> v);
+  void set_omega(std::span<const Spin<dim>> omega);
+
+ private:
+  struct Motion {
+    double speed = 0.0;   // largest approach of a pair or of a grain and a wall [m/s]
+    double rate = 0.0;    // largest speed of a pair over the distance of its centres [1/s]
+    double overlap = 0.0; // [m]
+  };
+  struct Sums {  // over the contacts of a block, added up in the order of the blocks
+    double power = 0.0;   // p . (u before + u after)/2 [J]: minus what the contacts dissipate
+    double branch = 0.0;  // [m]
+    long contacts = 0, candidates = 0;
+    Mat<dim> virial = Mat<dim>::Zero();
+  };
+
+  void prepare();
+  Motion measure_pairs();
+  double sub_step_length(double left, double dt, const Motion& motion) const;
+  void find_contacts(double h, double alert);
+  SolveReport solve_contacts(double h);
+  bool rebound();
+  void accelerate(double h);
+  void account(double h, StepReport<dim>& report);
+  void move(double h);
+  void set_by_id(std::size_t size, const char* where, const char* what) const;
+  void check_wall(int wall, const char* where) const;
+
+  Box<dim> box_;
+  Grains<dim> grains_;
+  std::vector<Wall<dim>> walls_;
+  Materials materials_;
+  Neighbours<dim> neighbours_;
+  int n_free_ = 0, n_fixed_ = 0;
+  double time_ = 0.0;
+  double last_h_ = 0.0;  // sub-step that the stored impulses belong to [s]
+
+  // Scratch of a sub-step; contacts sit in the slots of their block's pairs.
+  int threads_ = 1;
+  double mean_radius_ = 0.0, acceleration_ = 0.0;
+  bool friction_ = false, restitution_ = false, tangential_restitution_ = false;
+  std::vector<double> gap_;
+  std::vector<Contact<dim>> contacts_;
+  std::vector<WallContact<dim>> wall_contacts_;
+  std::vector<int> count_, active_, active_count_;
+  std::vector<Tangent<dim>> bias_t_, wall_bias_t_;
+  std::vector<Body<dim>> body_before_;
+  std::vector<Vec<dim>> wall_before_;
+  std::vector<Sums> sums_;
+};
+
+}  // namespace quicksand

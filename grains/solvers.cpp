@@ -1,0 +1,280 @@
+// Sweeps over contacts. Sums are kept per block and added in the order of the blocks: the same for any number of threads.
+#include "solvers.hpp"
+
+#include <limits>
+
+namespace quicksand {
+
+namespace {
+
+enum class Law { frictionless, coulomb, coulomb_restitution };
+
+struct Sums {
+  double change = 0.0;  // sum W_nn |dp|^2, or W_nn |e|^2
+  double size = 0.0;    // sum W_nn |p|^2
+  double worst = 0.0;   // largest W_nn |e|
+  Sums& operator+=(const Sums& other) {
+    change += other.change, size += other.size, worst = std::max(worst, other.worst);
+    return *this;
+  }
+};
+
+template <int dim>
+Vec<dim> vector(const Vec<dim>& n, double p_n, const Tangent<dim>& p_t) {
+  return p_n * n + tangent_vector(n, p_t);
+}
+
+template <Law law, int dim>
+void push(Body<dim>& a, Body<dim>& b, const Vec<dim>& n, double p_n, const Tangent<dim>& p_t, double spin_ratio) {
+  Vec<dim> p = p_n * n;
+  if constexpr (law != Law::frictionless) p += tangent_vector(n, p_t);
+  a.v -= a.inv_m * p;
+  b.v += b.inv_m * p;
+  if constexpr (law != Law::frictionless) {
+    const Spin<dim> torque = spin_ratio * turn(n, p_t);
+    a.s -= a.inv_m * torque;
+    b.s -= b.inv_m * torque;
+  }
+}
+
+template <Law law, int dim>
+void push(Wall<dim>& wall, Body<dim>& b, const Vec<dim>& n, double p_n, const Tangent<dim>& p_t, double spin_ratio) {
+  const Vec<dim> p = vector<dim>(n, p_n, p_t);
+  wall.v -= wall.inv_m.cwiseProduct(p);
+  b.v += b.inv_m * p;
+  if constexpr (law != Law::frictionless) b.s -= (b.inv_m * spin_ratio) * turn(n, p_t);
+}
+
+// Relative velocity at the contact: normal part, then tangential part.
+template <int dim>
+struct Slip {
+  double n;
+  Tangent<dim> t;
+};
+
+template <Law law, int dim>
+Slip<dim> slip(const Body<dim>& a, const Body<dim>& b, const Vec<dim>& n) {
+  const Vec<dim> u = b.v - a.v;
+  if constexpr (law == Law::frictionless) return {u.dot(n), zero<Tangent<dim>>()};
+  return {u.dot(n), tangential(u, n) - cross(Spin<dim>(a.s + b.s), n)};
+}
+
+template <Law law, int dim>
+Slip<dim> slip(const Wall<dim>& wall, const Body<dim>& b, const Vec<dim>& n) {
+  const Vec<dim> u = b.v - wall.v;
+  if constexpr (law == Law::frictionless) return {u.dot(n), zero<Tangent<dim>>()};
+  return {u.dot(n), tangential(u, n) - cross(b.s, n)};
+}
+
+template <class C>
+double inv_w_t(const C& c, double rolling) {
+  if constexpr (requires { c.inv_w_t; })
+    return c.inv_w_t;
+  else
+    return c.inv_w * rolling;
+}
+
+// One contact update; a is a Body or a Wall.
+template <Law law, int dim, class A, class C>
+void update(A& a, Body<dim>& b, C& c, const Tangent<dim>* bias_t, const Problem<dim>& problem, double omega, Sums& sums) {
+  Slip<dim> u = slip<law, dim>(a, b, c.n);
+  u.n += c.bias;
+  if (c.p.n == 0.0 && u.n >= 0.0) return;  // open and stays open
+  if constexpr (law == Law::coulomb_restitution) u.t += *bias_t;
+  const double rolling = 1.0 / (1.0 + problem.spin_ratio);
+  Impulse<dim> next;
+  if constexpr (law == Law::frictionless)
+    next.n = std::max(c.p.n - omega * c.inv_w * u.n, 0.0);
+  else
+    next = obey_coulomb<dim>(c.p, u.n, u.t, omega * c.inv_w, omega * inv_w_t(c, rolling), c.friction);
+  const double dn = next.n - c.p.n;
+  const Tangent<dim> dt = next.t - c.p.t;
+  push<law>(a, b, c.n, dn, dt, problem.spin_ratio);
+  c.p = next;
+  sums.change += (dn * dn + squared(dt)) / c.inv_w;
+  sums.size += (next.n * next.n + squared(next.t)) / c.inv_w;
+}
+
+template <Law law, int dim, class A, class C>
+void residual(const A& a, const Body<dim>& b, const C& c, const Tangent<dim>* bias_t, Sums& sums) {
+  Slip<dim> u = slip<law, dim>(a, b, c.n);
+  u.n += c.bias;
+  if (c.p.n == 0.0 && u.n >= 0.0) return;  // open: e = 0
+  if constexpr (law == Law::coulomb_restitution) u.t += *bias_t;
+  const double e2 = natural_map<dim>(c.p, u.n, u.t, c.inv_w, c.friction);
+  sums.change += e2 / c.inv_w;
+  sums.size += (c.p.n * c.p.n + squared(c.p.t)) / c.inv_w;
+  sums.worst = std::max(sums.worst, e2 / (c.inv_w * c.inv_w));
+}
+
+// What a pass over the contacts does with each.
+enum class Pass { all, active, residual };
+
+template <Law law, int dim>
+class Sweeper {
+ public:
+  explicit Sweeper(Problem<dim>& problem) : p_(problem), sums_(problem.blocks.size()) {}
+
+  // To be called by all threads of a team; ends with a barrier after which sums() holds.
+  void pass(Pass what, double omega) {
+    for (std::size_t colour = 0; colour + 1 < p_.colours.size(); ++colour) {
+#pragma omp for schedule(static)
+      for (int b = p_.colours[colour]; b < p_.colours[colour + 1]; ++b) sums_[b] = block(what, b, omega);
+    }
+#pragma omp single
+    {
+      total_ = {};
+      for (std::size_t k = 0; k < p_.wall_contacts.size(); ++k) {
+        WallContact<dim>& c = p_.wall_contacts[k];
+        const Tangent<dim>* bias_t = p_.wall_bias_t.empty() ? nullptr : &p_.wall_bias_t[k];
+        if (what == Pass::residual)
+          residual<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, bias_t, total_);
+        else
+          update<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, bias_t, p_, omega, total_);
+      }
+      for (const Sums& s : sums_) total_ += s;
+      if (what != Pass::residual) {
+        ++sweeps_;
+        updates_ += static_cast<long>(p_.wall_contacts.size());
+        for (std::size_t b = 0; b < p_.blocks.size(); ++b)
+          updates_ += what == Pass::active ? p_.active_count[b] : p_.count[b];
+      }
+    }
+  }
+
+  // Relative change, or relative residual, of the last pass.
+  double relative() const {
+    if (total_.change == 0.0) return 0.0;
+    return total_.size > 0.0 ? std::sqrt(total_.change / total_.size) : std::numeric_limits<double>::infinity();
+  }
+  double worst() const { return std::sqrt(total_.worst); }
+  int sweeps() const { return sweeps_; }
+  long updates() const { return updates_; }
+
+ private:
+  Sums block(Pass what, int b, double omega) {
+    Sums sums;
+    const int first = p_.blocks[b].begin;
+    auto bias_t = [&](int k) { return law == Law::coulomb_restitution ? &p_.bias_t[k] : nullptr; };
+    if (what == Pass::active) {
+      for (int a = first; a < first + p_.active_count[b]; ++a) {
+        const int k = p_.active[a];
+        Contact<dim>& c = p_.contacts[k];
+        update<law, dim>(p_.bodies[c.i], p_.bodies[c.j], c, bias_t(k), p_, omega, sums);
+      }
+    } else if (what == Pass::all) {
+      int n_active = 0;
+      for (int k = first; k < first + p_.count[b]; ++k) {
+        Contact<dim>& c = p_.contacts[k];
+        update<law, dim>(p_.bodies[c.i], p_.bodies[c.j], c, bias_t(k), p_, omega, sums);
+        p_.active[first + n_active] = k;
+        n_active += c.p.n > 0.0;
+      }
+      p_.active_count[b] = n_active;
+    } else {
+      for (int k = first; k < first + p_.count[b]; ++k) {
+        const Contact<dim>& c = p_.contacts[k];
+        residual<law, dim>(p_.bodies[c.i], p_.bodies[c.j], c, bias_t(k), sums);
+      }
+    }
+    return sums;
+  }
+
+  Problem<dim>& p_;
+  std::vector<Sums> sums_;
+  Sums total_;
+  int sweeps_ = 0;
+  long updates_ = 0;
+};
+
+// Sweeps until the residual is below the tolerance. The change of the impulses in a sweep over all contacts tells when the
+// residual is worth its pass.
+template <Law law, int dim>
+SolveReport relax(Problem<dim>& problem, const SolverSettings& settings, bool active_set) {
+  Sweeper<law, dim> sweeper(problem);
+  SolveReport report;
+  enum class Next { sweep, active, check, done } next = Next::sweep;
+  double omega = active_set ? settings.omega : 1.0;
+  double trial = settings.tolerance;  // change below which the residual is looked at
+  double before = std::numeric_limits<double>::infinity();
+  int slow = 0, limit = settings.max_sweeps;
+  bool fallen_back = !active_set;
+#pragma omp parallel num_threads(problem.threads)
+  while (next != Next::done) {
+    if (next == Next::active)
+      for (int k = 0; k < settings.active_sweeps; ++k) sweeper.pass(Pass::active, omega);
+    sweeper.pass(next == Next::check ? Pass::residual : Pass::all, omega);
+#pragma omp single
+    {
+      if (next == Next::check) {
+        report.residual = sweeper.relative();
+        report.worst = sweeper.worst();
+        report.converged = report.residual <= settings.tolerance;
+        const bool out_of_sweeps = sweeper.sweeps() >= limit;
+        if (report.converged || (out_of_sweeps && fallen_back)) {
+          next = Next::done;
+        } else {
+          trial = std::min(trial, before) * std::clamp(0.7 * settings.tolerance / report.residual, 0.1, 0.7);
+          next = fallen_back ? Next::sweep : Next::active;
+          if (out_of_sweeps) fallen_back = true, omega = 1.0, limit += settings.max_sweeps, next = Next::sweep;
+        }
+      } else {
+        const double change = sweeper.relative();
+        // Over-relaxation can cycle in dense states: three sweeps in a row that gain less than a fifth halve omega - 1.
+        slow = change > 0.8 * before ? slow + 1 : 0;
+        if (slow >= 3) omega = omega < 1.1 ? 1.0 : 1.0 + 0.5 * (omega - 1.0), slow = 0;
+        before = change;
+        next = change <= trial || sweeper.sweeps() >= limit ? Next::check : (fallen_back ? Next::sweep : Next::active);
+      }
+    }
+  }
+  report.sweeps = sweeper.sweeps();
+  report.updates = sweeper.updates();
+  return report;
+}
+
+template <int dim>
+SolveReport relax_by_law(Problem<dim>& problem, const SolverSettings& settings, bool active_set) {
+  if (!problem.friction) return relax<Law::frictionless>(problem, settings, active_set);
+  if (problem.bias_t.empty() && problem.wall_bias_t.empty())
+    return relax<Law::coulomb>(problem, settings, active_set);
+  return relax<Law::coulomb_restitution>(problem, settings, active_set);
+}
+
+}  // namespace
+
+template <int dim>
+SolveReport solve_nlgs(Problem<dim>& problem, const SolverSettings& settings) {
+  return relax_by_law(problem, settings, false);
+}
+
+template <int dim>
+SolveReport solve_active_set(Problem<dim>& problem, const SolverSettings& settings) {
+  return relax_by_law(problem, settings, true);
+}
+
+template <int dim>
+void warm_start(Problem<dim>& problem) {
+  auto start = [&](auto& a, Body<dim>& b, const auto& c) {
+    if (c.p.n > 0.0) push<Law::coulomb>(a, b, c.n, c.p.n, c.p.t, problem.spin_ratio);
+  };
+#pragma omp parallel num_threads(problem.threads)
+  for (std::size_t colour = 0; colour + 1 < problem.colours.size(); ++colour) {
+#pragma omp for schedule(static)
+    for (int b = problem.colours[colour]; b < problem.colours[colour + 1]; ++b)
+      for (int k = problem.blocks[b].begin; k < problem.blocks[b].begin + problem.count[b]; ++k) {
+        const Contact<dim>& c = problem.contacts[k];
+        start(problem.bodies[c.i], problem.bodies[c.j], c);
+      }
+  }
+  for (const WallContact<dim>& c : problem.wall_contacts) start(problem.walls[c.wall], problem.bodies[c.j], c);
+}
+
+template SolveReport solve_nlgs(Problem<2>&, const SolverSettings&);
+template SolveReport solve_nlgs(Problem<3>&, const SolverSettings&);
+template SolveReport solve_active_set(Problem<2>&, const SolverSettings&);
+template SolveReport solve_active_set(Problem<3>&, const SolverSettings&);
+template void warm_start(Problem<2>&);
+template void warm_start(Problem<3>&);
+
+}  // namespace quicksand

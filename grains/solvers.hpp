@@ -1,0 +1,58 @@
+// The contact problem of one sub-step and the solvers for it. A solver is a function from a Problem to a SolveReport; it changes
+// velocities and impulses together, so that v = v_free + M^-1 H p holds at every moment. A new solver is one more such function.
+#pragma once
+
+#include "contact.hpp"
+#include "neighbours.hpp"
+
+#include <span>
+
+namespace quicksand {
+
+template <int dim>
+struct Problem {
+  std::span<Body<dim>> bodies;
+  std::span<Wall<dim>> walls;
+  std::span<const Block> blocks;                  // slots of `contacts` that belong to each block
+  std::span<const int> colours;                   // see Neighbours
+  std::span<const int> count;                     // contacts in use, from the first slot of each block
+  std::span<Contact<dim>> contacts;
+  std::span<WallContact<dim>> wall_contacts;
+  std::span<const Tangent<dim>> bias_t;           // tangential restitution e_t u_t^- per slot [m/s]; empty: none
+  std::span<const Tangent<dim>> wall_bias_t;
+  std::span<int> active;                          // scratch, one per slot
+  std::span<int> active_count;                    // scratch, one per block
+  double spin_ratio;                              // m r^2/I [-]
+  bool friction;                                  // false: no contact has any, and nothing turns
+  int threads;
+};
+
+struct SolverSettings {
+  double tolerance = 1e-3;   // on the residual [-]
+  int max_sweeps = 1000;     // over the contacts, then as many again by the fallback
+  int active_sweeps = 6;     // over load-bearing contacts after each sweep over all
+  double omega = 1.5;        // over-relaxation to start from [-]
+};
+
+struct SolveReport {
+  int sweeps = 0;            // over all contacts or over the load-bearing ones
+  long updates = 0;          // contacts visited in these sweeps
+  double residual = 0.0;     // |D e|/|D r|, e the natural map, D = sqrt(W_nn) [-]
+  double worst = 0.0;        // largest W_nn |e| of one contact: a velocity [m/s]
+  bool converged = true;
+};
+
+// Nonlinear Gauss-Seidel, M. Jean, CMAME 177 (1999): the reference.
+template <int dim>
+SolveReport solve_nlgs(Problem<dim>& problem, const SolverSettings& settings);
+
+// Over-relaxed Gauss-Seidel, a sweep over all contacts followed by several over those that bear load; the relaxation falls back
+// towards 1 when progress stalls, then to solve_nlgs.
+template <int dim>
+SolveReport solve_active_set(Problem<dim>& problem, const SolverSettings& settings);
+
+// Adds H p of the stored impulses to the velocities.
+template <int dim>
+void warm_start(Problem<dim>& problem);
+
+}  // namespace quicksand

@@ -1,0 +1,185 @@
+"""Figures of a study, as PNG files. Drawn by matplotlib's Agg canvas: no window, no global state."""
+
+import numpy as np
+
+INK, FAINT, BLUE, RED, GREEN = "#222222", "#9aa5b1", "#1f5fa8", "#c2452d", "#2e7d4f"
+STYLE = {
+    "font.size": 10, "axes.edgecolor": INK, "axes.labelcolor": INK, "axes.spines.top": False, "axes.spines.right": False,
+    "axes.grid": True, "grid.color": "#e6e9ed", "grid.linewidth": 0.7, "axes.axisbelow": True, "lines.linewidth": 1.3,
+    "legend.frameon": False, "legend.fontsize": 9, "savefig.dpi": 150, "mathtext.fontset": "dejavusans",
+}
+
+
+def _figure(rows, columns, size, **options):
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(rows, columns, **options)
+
+
+def _styled(draw):
+    """Run a drawing function in the style of all figures."""
+    import functools
+
+    @functools.wraps(draw)
+    def styled(*args, **kwargs):
+        import matplotlib
+
+        with matplotlib.rc_context(STYLE):
+            return draw(*args, **kwargs)
+
+    return styled
+
+
+@_styled
+def plot_series(path, time, panels, steady_from=None):
+    """Time series below each other, the steady window shaded and its means drawn.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+    time : (n,) array
+        [s]
+    panels : list of (label, series, mean)
+        series (n,) array; mean is a number or None. The few most extreme samples may leave the panel.
+    steady_from : float, optional
+        Start of the steady window [s].
+    """
+    figure, axes = _figure(len(panels), 1, (8, 1.9 * len(panels)), sharex=True, squeeze=False)
+    for axis, (label, series, mean) in zip(axes[:, 0], panels):
+        axis.plot(time, series, color=BLUE, linewidth=0.6)
+        axis.set_ylabel(label)
+        finite = series[np.isfinite(series)]
+        if finite.size:
+            low, high = np.percentile(finite, [0.1, 99.9])
+            room = 0.08 * (high - low) or 0.05 * abs(high) or 1.0
+            axis.set_ylim(low - room, high + room)
+        if steady_from is not None:
+            axis.axvspan(steady_from, time[-1], color=GREEN, alpha=0.1, linewidth=0)
+            if mean is not None:
+                axis.plot([steady_from, time[-1]], [mean, mean], color=RED)
+                axis.annotate(f"{mean:.4g}", (1.01, mean), xycoords=("axes fraction", "data"), color=RED, va="center",
+                              annotation_clip=False)
+    axes[-1, 0].set_xlabel("$t$ [s]")
+    axes[-1, 0].set_xlim(0, time[-1])
+    if steady_from is not None:
+        axes[0, 0].set_title(f"shaded: steady from $t$ = {steady_from:.2f} s, red: mean", fontsize=9, color=INK, loc="right")
+    figure.savefig(path)
+
+
+@_styled
+def plot_profile(path, profile, nominal_rate):
+    """Solid fraction, velocity and temperature across the cell.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+    profile : quicksand.grains.Profile
+    nominal_rate : float
+        Difference of the walls' speeds over the height [1/s].
+    """
+    figure, (phi, velocity, temperature) = _figure(1, 3, (11, 4.4), sharey=True)
+    y, middle = 1e3 * profile.position, profile.height / 2
+    phi.plot(profile.solid_fraction, y, color=BLUE)
+    phi.set(xlabel=r"solid fraction $\phi$ [-]", ylabel="$y$ above the lower wall [mm]", ylim=(0, 1e3 * profile.height))
+
+    velocity.plot(profile.velocity[:, 0], y, ".", color=BLUE)
+    velocity.plot(nominal_rate * (profile.position - middle), y, color=FAINT, label=f"nominal, {nominal_rate:.3g} 1/s")
+    slope = profile.shear_rate()
+    if slope is not None:
+        inside = np.abs(profile.position - middle) <= profile.height / 4
+        offset = np.nanmean(profile.velocity[inside, 0])
+        velocity.plot(offset + slope * (profile.position[inside] - middle), y[inside], color=RED, label=f"bulk, {slope:.3g} 1/s")
+    velocity.set(xlabel=r"$\langle v_x \rangle$ [m/s]")
+    velocity.legend(loc="upper left")
+
+    temperature.plot(profile.temperature[:, 0], y, color=BLUE, label="$T_x$")
+    temperature.plot(profile.temperature[:, 1], y, color=RED, label="$T_y$")
+    temperature.set(xlabel=r"$\langle v^2 \rangle - \langle v \rangle^2$ [m$^2$/s$^2$]")
+    temperature.set_xlim(left=0)
+    temperature.ticklabel_format(axis="x", style="sci", scilimits=(-2, 2), useMathText=True)
+    temperature.legend()
+    figure.savefig(path)
+
+
+@_styled
+def plot_snapshot(path, sim, period, low, high, fixed=None, title=""):
+    """Discs coloured by v_x, with the normal contact forces as lines between centres (force chains).
+
+    Parameters
+    ----------
+    path : pathlib.Path
+    sim : quicksand.grains.Simulation
+        Two-dimensional, periodic in x on [-period/2, period/2).
+    period : float
+        [m]
+    low, high : float
+        Heights of the walls [m].
+    fixed : (position (n, 2), radius (n,)), optional
+        Discs that belong to the walls [m].
+    title : str
+    """
+    from matplotlib.collections import LineCollection
+
+    height = high - low
+    figure, axis = _figure(1, 1, (11, min(1.5 + 9.5 * height / period, 20)))
+    position, radius, speed = sim.position, sim.radius, sim.velocity[:, 0]
+    bound = max(np.abs(speed).max(), 1e-12)
+    discs = _discs(axis, position, radius, period, speed, cmap="RdBu_r", clim=(-bound, bound), linewidths=0.25, edgecolors=FAINT)
+    if fixed is not None:
+        _discs(axis, *fixed, period, None, facecolors=FAINT, edgecolors=INK, linewidths=0.25)
+    for y in (low, high):
+        axis.axhline(y, color=INK, linewidth=1.5)
+
+    lines, force = _branches(sim, position, period)
+    if force.size:
+        thickest = np.percentile(force, 99)
+        widths = 2.5 * np.minimum(force / thickest, 2.0) if thickest > 0 else 0.0
+        axis.add_collection(LineCollection(lines, linewidths=widths, colors=INK, alpha=0.75, capstyle="round"))
+        axis.text(1.0, -0.09, f"line width proportional to the normal force, 2.5 points: {thickest:.2g} N/m",
+                  transform=axis.transAxes, ha="right", va="top", fontsize=8, color=INK)
+
+    edge = 0.02 * height + (2 * radius.mean() if fixed is not None else 0.0)
+    axis.set(xlim=(-period / 2, period / 2), ylim=(low - edge, high + edge), aspect="equal", xlabel="$x$ [m]", ylabel="$y$ [m]")
+    axis.grid(False)
+    axis.set_title(title, fontsize=10)
+    figure.colorbar(discs, ax=axis, label="$v_x$ [m/s]", fraction=0.025, pad=0.01)
+    figure.savefig(path, dpi=200, bbox_inches="tight")
+
+
+def _discs(axis, position, radius, period, value, **options):
+    """Add discs and, for those that cross an end of the period, their images on the other side."""
+    from matplotlib.collections import EllipseCollection
+
+    x = (position[:, 0] + period / 2) % period - period / 2
+    crossing = np.flatnonzero(np.abs(x) + radius > period / 2)
+    which = np.concatenate([np.arange(len(x)), crossing])
+    offsets = np.column_stack([x, position[:, 1]])[which]
+    offsets[len(x):, 0] -= np.copysign(period, x[crossing])
+    diameter = 2 * radius[which]
+    discs = EllipseCollection(diameter, diameter, 0.0, units="xy", offsets=offsets, offset_transform=axis.transData,
+                              array=None if value is None else value[which], **options)
+    return axis.add_collection(discs)
+
+
+def _branches(sim, position, period):
+    """Segments (n, 2, 2) [m] from centre to centre, or to the wall, and their normal forces (n,) [N/m].
+
+    A segment that leaves the period is drawn from both of its ends.
+    """
+    contacts = sim.contacts()
+    loaded = contacts["force_normal"] > 0
+    i, j = contacts["grain_i"][loaded], contacts["grain_j"][loaded]
+    point, force = contacts["point"][loaded], contacts["force_normal"][loaded]
+
+    def centre(grain):
+        return np.where((grain >= 0)[:, None], position[np.maximum(grain, 0)], point)
+
+    start, branch = centre(i), centre(j) - centre(i)
+    branch[:, 0] -= period * np.round(branch[:, 0] / period)
+    start[:, 0] -= period * np.round(start[:, 0] / period)
+    end = start + branch
+    leaves = np.abs(end[:, 0]) > period / 2
+    shift = np.column_stack([np.copysign(period, end[leaves, 0]), np.zeros(leaves.sum())])
+    segments = np.stack([start, end], axis=1)
+    return np.concatenate([segments, segments[leaves] - shift[:, None, :]]), np.concatenate([force, force[leaves]])

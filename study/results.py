@@ -1,0 +1,71 @@
+"""What a study leaves behind: results.json and a table on the terminal."""
+
+import json
+import math
+import os
+import tempfile
+
+import numpy as np
+
+
+def write_results(path, results):
+    """Write a flat dict as JSON; None and NaN become null. A reader sees the old file or the whole new one.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+    results : dict
+        Numbers in SI, strings, None, or lists of these.
+    """
+    text = json.dumps({key: _plain(value) for key, value in results.items()}, indent=2, allow_nan=False) + "\n"
+    with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=path.name, suffix=".part", delete=False) as file:
+        try:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+            os.fchmod(file.fileno(), 0o644)  # NamedTemporaryFile makes it 0600
+            os.replace(file.name, path)
+        except BaseException:
+            os.unlink(file.name)
+            raise
+
+
+def _plain(value):
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def print_summary(title, results, units, references=None):
+    """Print results as a table, with NAME_err and NAME_std beside NAME.
+
+    Parameters
+    ----------
+    title : str
+    results : dict
+    units : dict
+        The quantities to print, in this order, and their units.
+    references : dict, optional
+        Published values as text, by quantity; adds a column.
+    """
+    table = [["quantity", "unit", "value", "+- error", "(std)"]]
+    for name, unit in units.items():
+        value = results[name]
+        table.append([name, unit, str(value) if isinstance(value, int) else _text(value, "{:.4g}") or "-",
+                      _text(results.get(f"{name}_err"), "+- {:.2g}"), _text(results.get(f"{name}_std"), "({:.2g})")])
+    if references:
+        for row in table:
+            row.append(references.get(row[0], ""))
+        table[0][-1] = "thesis"
+    widths = [max(map(len, column)) for column in zip(*table)]
+    print(title)
+    for row in table:
+        print("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip())
+
+
+def _text(value, form):
+    return "" if value is None else form.format(value)
