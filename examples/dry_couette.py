@@ -23,7 +23,7 @@ Flags
     --threads N         (all cores); results do not depend on it
     --seed N            of the radii, and of the small random velocities without which a lattice has no randomness:
                         uniform within 1 % of the wall speed, per component (0)
-    --quick             a run of some seconds: --height 0.03 --width 0.06 --t-end 4, where not given
+    --quick             a run of some seconds: --height 0.03 --width 0.06 --t-end 2, where not given
     --no-plots          results.json only
 
 results.json, SI, null where undefined. Means are over t >= t_converged, one sample per time step; X_std is the standard
@@ -43,7 +43,7 @@ of contacts between grains only.
                                 all parts
     inertial_number_bulk        the same with shear_rate_bulk
     psi6                        hexagonal order at the end, mean of |psi_6| over grains 3 diameters away from walls [-]
-    coordination                load-bearing contacts per grain [-]
+    coordination                2 x contacts that bear an impulse in a sub-step / grains [-]; fewer in shorter sub-steps
     t_converged                 start of the steady state [s], thesis section 2.4; it looks at h only, so with --fixed-height
                                 it is 10 % of the time
     state                       "jammed": over the last third of the time the bulk rate is below 5 % of nominal; else "flowing".
@@ -76,7 +76,7 @@ THESIS = {  # table 3.1, mean (std); where these flags have their defaults
 
 
 def parse_flags():
-    parser = study.Parser(__doc__, out="out/dry_couette", dt=1e-3, t_end=10.0, quick_t_end=4.0)
+    parser = study.Parser(__doc__, out="out/dry_couette", dt=1e-3, t_end=10.0, quick_t_end=2.0)
     parser.flag("--rate", type=study.number("1/s", above=0), default=10.0)
     parser.flag("--pressure", type=study.number("Pa", above=0), default=5.0)
     parser.flag("--size-ratio", type=study.number("", at_least=1), default=1.0)
@@ -119,8 +119,8 @@ class Scene:
         self.sim.set_friction("grain", "wall", flags.wall_friction)
         self.sim.add(position, radius, density=DENSITY, velocity=velocity, material="grain")
 
-        self.closing_until = flags.t_end / 10 if flags.fixed_height and height > flags.height else 0.0
-        closing_speed = (height - flags.height) / 2 / self.closing_until if self.closing_until else 0.0
+        self.closing_until = max(1, round(0.1 * flags.t_end / flags.dt)) * flags.dt
+        closing_speed = (height - flags.height) / 2 / self.closing_until  # 0 with L = 1
         self.walls = []
         for side in (-1, 1):
             across = {"velocity": (side * speed, None), "load": (None, -side * flags.pressure * flags.width)}
@@ -131,7 +131,7 @@ class Scene:
         self.fixed = self.attach_rows() if flags.rough_walls else None
 
     def attach_rows(self):
-        columns = int(self.width / (2 * RADIUS))
+        columns = int(self.width / (2 * RADIUS) + 1e-9)
         x = (np.arange(columns) + 0.5) / columns * self.width - self.width / 2
         rows = [np.column_stack([x, np.full(columns, wall.position[1])]) for wall in self.walls]
         for wall, row in zip(self.walls, rows):
@@ -141,7 +141,6 @@ class Scene:
     def hold_height(self):
         for wall in self.walls:
             wall.drive(axis=1, velocity=0.0)
-        self.closing_until = 0.0
 
     @property
     def faces(self):
@@ -170,10 +169,10 @@ def simulate(scene, flags):
                    sigma_yy_wall_contacts=report.virial_wall_contacts[1, 1] / area,
                    sigma_yy_kinetic=report.virial_kinetic[1, 1] / area,
                    wall_pressure=(upper.force[1] - lower.force[1]) / (2 * flags.width),
-                   branch_length=report.branch_length, coordination=report.coordination)
+                   branch_length=report.branch_length or np.nan, coordination=report.coordination)
         if run.samples % PROFILE_EVERY == 0:
             profiles.sample(scene.sim, low, high)
-        if 0.0 < scene.closing_until <= scene.sim.time + flags.dt / 2:
+        if flags.fixed_height and scene.sim.time > scene.closing_until - flags.dt / 2:
             scene.hold_height()
     return run, profiles
 
@@ -235,7 +234,7 @@ def plot(results, scene, run, profile, flags):
     ], results["t_converged"])
     if profile:
         study.plot_profile(flags.out / "profiles.png", profile, flags.rate * flags.height / profile.height)
-    study.plot_snapshot(flags.out / "snapshot.png", scene.sim, flags.width, *scene.faces, scene.fixed_grains(),
+    study.plot_snapshot(flags.out / "snapshot.png", scene.sim, *scene.faces, scene.fixed_grains(),
                         title=f"$t$ = {scene.sim.time:.3g} s")
 
 

@@ -91,7 +91,7 @@ class Known {
 template <int dim>
 CloseGrains<dim>::CloseGrains(std::span<const Vec<dim>> x, std::span<const double> r, const Box<dim>& box, double factor,
                               double skin)
-    : x_(x), r_(r), box_(box), factor_(factor), skin_(skin), level_of_(x.size()) {
+    : x_(x), r_(r), box_(box), factor_(factor), skin_(skin), level_of_(x.size()), place_(x.size()) {
   const double r_min = r.empty() ? 1.0 : *std::min_element(r.begin(), r.end());
   for (std::size_t i = 0; i < x.size(); ++i) {
     const auto l = static_cast<std::size_t>(std::log2(r[i] / r_min));
@@ -108,19 +108,24 @@ CloseGrains<dim>::CloseGrains(std::span<const Vec<dim>> x, std::span<const doubl
     level.cells = count_cells<dim>(low, high, factor * 2 * level.r_max + skin, 4.0 * level.grains.size() + 64);
     level.inv_size = inverse_size<dim>(low, high, level.cells);
     keys.clear();
-    for (int i : level.grains) keys.push_back(cell_of(level, x[i]));
     int total = 1;
     for (int c : level.cells) total *= c;
-    for (int k : sort_by_key(keys, total, level.start)) level.member.push_back(level.grains[k]);
+    for (int i : level.grains) {
+      int key = 0;
+      const auto c = own_cell(level, x[i]);
+      for (int k = 0; k < dim; ++k) key = key * level.cells[k] + c[k];
+      keys.push_back(key);
+    }
+    for (int k : sort_by_key(keys, total, level.start)) {
+      place_[level.grains[k]] = static_cast<int>(level.member.size());
+      level.member.push_back(level.grains[k]);
+    }
   }
 }
 
 template <int dim>
-int CloseGrains<dim>::cell_of(const Level& level, const Vec<dim>& x) const {
-  const auto c = cell_at<dim>(x, level.low, level.inv_size, level.cells);
-  int cell = c[0];
-  for (int k = 1; k < dim; ++k) cell = cell * level.cells[k] + c[k];
-  return cell;
+std::array<int, dim> CloseGrains<dim>::own_cell(const Level& level, const Vec<dim>& x) const {
+  return cell_at<dim>(x, level.low, level.inv_size, level.cells);
 }
 
 template <int dim>

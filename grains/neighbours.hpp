@@ -80,7 +80,7 @@ class Neighbours {
 };
 
 // Calls visit(i, j, shift code) for each pair with |x_j - x_i| < factor (r_i + r_j) + skin, once, i of the smaller size class.
-// Needs periods of at least two reaches.
+// Positions must be wrapped into the box, and periods longer than two reaches.
 template <int dim>
 class CloseGrains {
  public:
@@ -93,15 +93,16 @@ class CloseGrains {
     double r_max = 0.0;
     Vec<dim> low, inv_size;
     std::array<int, dim> cells{};
-    std::vector<int> start, member;
+    std::vector<int> start, member;  // grains by cell, the last axis fastest
     std::vector<int> grains;
   };
-  int cell_of(const Level& level, const Vec<dim>& x) const;
+  std::array<int, dim> own_cell(const Level& level, const Vec<dim>& x) const;
   std::span<const Vec<dim>> x_;
   std::span<const double> r_;
   const Box<dim>& box_;
   double factor_, skin_;
   std::vector<std::uint8_t> level_of_;
+  std::vector<int> place_;  // of each grain in `member` of its level
   std::vector<Level> levels_;
 };
 
@@ -113,40 +114,56 @@ void CloseGrains<dim>::visit(int i, Visit&& visit) const {
     const Level& level = levels_[l];
     if (level.grains.empty()) continue;
     const double reach = factor_ * (r_[i] + level.r_max) + skin_;
-    std::array<int, 3> lo{}, hi{};
+    std::array<int, dim> lo, hi;  // cells to look at; beyond the ends along periodic axes: images
     for (int k = 0; k < dim; ++k) {
       lo[k] = static_cast<int>(std::floor((x[k] - reach - level.low[k]) * level.inv_size[k]));
       hi[k] = static_cast<int>(std::floor((x[k] + reach - level.low[k]) * level.inv_size[k]));
-      const bool around = box_.period[k] > 0;
-      if (!around) lo[k] = std::max(lo[k], 0), hi[k] = std::min(hi[k], level.cells[k] - 1);
-      if (around && hi[k] - lo[k] + 1 >= level.cells[k]) lo[k] = 0, hi[k] = level.cells[k] - 1;
+      if (box_.period[k] == 0) lo[k] = std::max(lo[k], 0), hi[k] = std::min(hi[k], level.cells[k] - 1);
     }
-    auto wrapped = [&](int c, int k) {
-      return c < 0 ? c + level.cells[k] : (c >= level.cells[k] ? c - level.cells[k] : c);
+    // Within a size class each pair is met once: cells after the grain's own, in the order of `member`, and the rest of its own.
+    const bool same = l == level_of_[i];
+    std::array<int, dim> from = lo;
+    if (same) from = own_cell(level, x);
+    const double own = factor_ * r_[i] + skin_;
+    auto row = [&](int begin, int end, const Vec<dim>& at, int code) {
+      for (int m = begin; m < end; ++m) {
+        const int j = level.member[m];
+        const double near = own + factor_ * r_[j];
+        if ((x_[j] - at).squaredNorm() < near * near) visit(i, j, code);
+      }
     };
-    for (int c2 = lo[2]; c2 <= hi[2]; ++c2)
-      for (int c1 = lo[1]; c1 <= hi[1]; ++c1)
-        for (int c0 = lo[0]; c0 <= hi[0]; ++c0) {
-          int cell = wrapped(c0, 0);
-          if constexpr (dim == 3) cell = wrapped(c2, 2) + level.cells[2] * (wrapped(c1, 1) + level.cells[1] * cell);
-          if constexpr (dim == 2) cell = wrapped(c1, 1) + level.cells[1] * cell;
-          for (int m = level.start[cell]; m < level.start[cell + 1]; ++m) {
-            const int j = level.member[m];
-            if (l == level_of_[i] && j <= i) continue;
-            Vec<dim> ab = x_[j] - x;
-            int code = 0;
-            for (int k = 0; k < dim; ++k) {
-              int turns = 1;  // 0: image one period up, 1: none, 2: one period down
-              if (box_.period[k] > 0) {
-                if (ab[k] < -0.5 * box_.period[k]) ab[k] += box_.period[k], turns = 0;
-                else if (ab[k] > 0.5 * box_.period[k]) ab[k] -= box_.period[k], turns = 2;
-              }
-              code = 3 * code + turns;
-            }
-            const double near = factor_ * (r_[i] + r_[j]) + skin_;
-            if (ab.squaredNorm() < near * near) visit(i, j, code);
-          }
+    // Cells that follow each other along the last axis hold grains that follow each other in `member`.
+    auto rows = [&](int cell, bool own_row, Vec<dim> at, int code) {
+      constexpr int k = dim - 1;
+      const int n = level.cells[k], around = box_.period[k] > 0;
+      for (int turn = -around; turn <= around; ++turn) {
+        const int first = std::max((own_row ? from[k] : lo[k]) - turn * n, 0), last = std::min(hi[k] - turn * n, n - 1);
+        if (first > last) continue;
+        Vec<dim> seen = at;
+        seen[k] -= turn * box_.period[k];
+        const int begin = own_row && turn == 0 ? place_[i] + 1 : level.start[cell * n + first];
+        row(begin, level.start[cell * n + last + 1], seen, 3 * code + 1 - turn);
+      }
+    };
+    auto turned = [&](int c, int k) { return c < 0 ? -1 : (c >= level.cells[k] ? 1 : 0); };
+    for (int c0 = from[0]; c0 <= hi[0]; ++c0) {
+      Vec<dim> at = x;
+      const int turn0 = turned(c0, 0);
+      at[0] -= turn0 * box_.period[0];
+      const int cell0 = c0 - turn0 * level.cells[0];
+      const bool own0 = same && c0 == from[0];
+      if constexpr (dim == 2) {
+        rows(cell0, own0, at, 1 - turn0);
+      } else {
+        for (int c1 = own0 ? from[1] : lo[1]; c1 <= hi[1]; ++c1) {
+          const int turn1 = turned(c1, 1);
+          Vec<dim> seen = at;
+          seen[1] -= turn1 * box_.period[1];
+          rows(cell0 * level.cells[1] + c1 - turn1 * level.cells[1], own0 && c1 == from[1], seen,
+               3 * (1 - turn0) + 1 - turn1);
         }
+      }
+    }
   }
 }
 

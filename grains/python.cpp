@@ -225,7 +225,7 @@ void bind(py::module_& m, const char* suffix) {
                     [](Sim& s, double v) {
                       if (!(v > 0)) throw std::invalid_argument(fmt::format("tolerance: must be > 0, got {}", v));
                       s.settings.solve.tolerance = v;
-                    }, "on the residual of every sub-step [-]")
+                    }, "of every sub-step, on the residual [-]; no contact may be wrong by more than tolerance/20 mean diameters")
       .def_property("max_sweeps", [](const Sim& s) { return s.settings.solve.max_sweeps; },
                     [](Sim& s, int v) {
                       if (v < 1) throw std::invalid_argument(fmt::format("max_sweeps: must be >= 1, got {}", v));
@@ -240,7 +240,7 @@ void bind(py::module_& m, const char* suffix) {
                     [](Sim& s, int v) {
                       if (v < 1) throw std::invalid_argument(fmt::format("active_sweeps: must be >= 1, got {}", v));
                       s.settings.solve.active_sweeps = v;
-                    }, "over load-bearing contacts between sweeps over all")
+                    }, "over unsettled contacts between sweeps over all")
       .def_property("sub_step_motion", [](const Sim& s) { return s.settings.sub_step_motion; },
                     [](Sim& s, double v) {
                       if (!(v > 0 && v <= 0.5)) throw std::invalid_argument(fmt::format("sub_step_motion: must be in (0, 0.5], got {}", v));

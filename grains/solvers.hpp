@@ -5,6 +5,7 @@
 #include "contact.hpp"
 #include "neighbours.hpp"
 
+#include <limits>
 #include <span>
 
 namespace quicksand {
@@ -20,22 +21,23 @@ struct Problem {
   std::span<WallContact<dim>> wall_contacts;
   std::span<const Tangent<dim>> bias_t;           // tangential restitution e_t u_t^- per slot [m/s]; empty: none
   std::span<const Tangent<dim>> wall_bias_t;
-  std::span<int> active;                          // scratch, one per slot
-  std::span<int> active_count;                    // scratch, one per block
+  std::span<int> unsettled;                       // scratch, one per slot
+  std::span<int> unsettled_count;                 // scratch, one per block
   double spin_ratio;                              // m r^2/I [-]
   bool friction;                                  // false: no contact has any, and nothing turns
   int threads;
 };
 
 struct SolverSettings {
-  double tolerance = 1e-3;   // on the residual [-]
+  double tolerance = 1e-2;   // on the residual [-]
+  double worst = std::numeric_limits<double>::infinity();  // on W_nn |e| of every contact [m/s]
   int max_sweeps = 1000;     // over the contacts, then as many again by the fallback
-  int active_sweeps = 6;     // over load-bearing contacts after each sweep over all
+  int active_sweeps = 6;     // over contacts that have not settled, after each sweep over all
   double omega = 1.5;        // over-relaxation to start from [-]
 };
 
 struct SolveReport {
-  int sweeps = 0;            // over all contacts or over the load-bearing ones
+  int sweeps = 0;            // over all contacts or over the unsettled ones
   long updates = 0;          // contacts visited in these sweeps
   double residual = 0.0;     // |D e|/|D r|, e the natural map, D = sqrt(W_nn) [-]
   double worst = 0.0;        // largest W_nn |e| of one contact: a velocity [m/s]
@@ -46,8 +48,8 @@ struct SolveReport {
 template <int dim>
 SolveReport solve_nlgs(Problem<dim>& problem, const SolverSettings& settings);
 
-// Over-relaxed Gauss-Seidel, a sweep over all contacts followed by several over those that bear load; the relaxation falls back
-// towards 1 when progress stalls, then to solve_nlgs.
+// Over-relaxed Gauss-Seidel, a sweep over all contacts followed by several over those whose impulse has not settled yet; the
+// relaxation falls back towards 1 when progress stalls, then to solve_nlgs.
 template <int dim>
 SolveReport solve_active_set(Problem<dim>& problem, const SolverSettings& settings);
 

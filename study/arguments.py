@@ -61,10 +61,10 @@ class Parser(argparse.ArgumentParser):
 
     @contextlib.contextmanager
     def user_errors(self):
-        """Around what a wrong flag can break (the scene, not the run): ValueError and OSError end the program."""
+        """Around what a wrong flag can break (the scene, not the run): such errors end the program."""
         try:
             yield
-        except (ValueError, OSError) as error:
+        except (ValueError, OSError, MemoryError) as error:
             self.error(str(error))
 
     def format_help(self):

@@ -68,14 +68,14 @@ def plot_series(path, time, panels, steady_from=None):
 
 
 @_styled
-def plot_profile(path, profile, nominal_rate):
+def plot_profile(path, profile, wall_rate):
     """Solid fraction, velocity and temperature across the cell.
 
     Parameters
     ----------
     path : pathlib.Path
     profile : quicksand.grains.Profile
-    nominal_rate : float
+    wall_rate : float
         Difference of the walls' speeds over the height [1/s].
     """
     figure, (phi, velocity, temperature) = _figure(1, 3, (11, 4.4), sharey=True)
@@ -84,35 +84,36 @@ def plot_profile(path, profile, nominal_rate):
     phi.set(xlabel=r"solid fraction $\phi$ [-]", ylabel="$y$ above the lower wall [mm]", ylim=(0, 1e3 * profile.height))
 
     velocity.plot(profile.velocity[:, 0], y, ".", color=BLUE)
-    velocity.plot(nominal_rate * (profile.position - middle), y, color=FAINT, label=f"nominal, {nominal_rate:.3g} 1/s")
+    velocity.plot(wall_rate * (profile.position - middle), y, color=FAINT, label=f"walls, {wall_rate:.3g} 1/s")
     slope = profile.shear_rate()
     if slope is not None:
         inside = np.abs(profile.position - middle) <= profile.height / 4
         offset = np.nanmean(profile.velocity[inside, 0])
         velocity.plot(offset + slope * (profile.position[inside] - middle), y[inside], color=RED, label=f"bulk, {slope:.3g} 1/s")
     velocity.set(xlabel=r"$\langle v_x \rangle$ [m/s]")
-    velocity.legend(loc="upper left")
+    velocity.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
 
     temperature.plot(profile.temperature[:, 0], y, color=BLUE, label="$T_x$")
     temperature.plot(profile.temperature[:, 1], y, color=RED, label="$T_y$")
     temperature.set(xlabel=r"$\langle v^2 \rangle - \langle v \rangle^2$ [m$^2$/s$^2$]")
-    temperature.set_xlim(left=0)
-    temperature.ticklabel_format(axis="x", style="sci", scilimits=(-2, 2), useMathText=True)
-    temperature.legend()
+    if np.nanmax(profile.temperature) > 10 * np.nanmin(profile.temperature) > 0:
+        temperature.set_xscale("log")
+    else:
+        temperature.set_xlim(left=0)
+        temperature.ticklabel_format(axis="x", style="sci", scilimits=(-2, 2), useMathText=True)
+    temperature.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
     figure.savefig(path)
 
 
 @_styled
-def plot_snapshot(path, sim, period, low, high, fixed=None, title=""):
+def plot_snapshot(path, sim, low, high, fixed=None, title=""):
     """Discs coloured by v_x, with the normal contact forces as lines between centres (force chains).
 
     Parameters
     ----------
     path : pathlib.Path
     sim : quicksand.grains.Simulation
-        Two-dimensional, periodic in x on [-period/2, period/2).
-    period : float
-        [m]
+        Two-dimensional, periodic in x.
     low, high : float
         Heights of the walls [m].
     fixed : (position (n, 2), radius (n,)), optional
@@ -121,7 +122,7 @@ def plot_snapshot(path, sim, period, low, high, fixed=None, title=""):
     """
     from matplotlib.collections import LineCollection
 
-    height = high - low
+    period, height = sim.period[0], high - low
     figure, axis = _figure(1, 1, (11, min(1.5 + 9.5 * height / period, 20)))
     position, radius, speed = sim.position, sim.radius, sim.velocity[:, 0]
     bound = max(np.abs(speed).max(), 1e-12)
@@ -135,7 +136,7 @@ def plot_snapshot(path, sim, period, low, high, fixed=None, title=""):
     if force.size:
         thickest = np.percentile(force, 99)
         widths = 2.5 * np.minimum(force / thickest, 2.0) if thickest > 0 else 0.0
-        axis.add_collection(LineCollection(lines, linewidths=widths, colors=INK, alpha=0.75, capstyle="round"))
+        axis.add_collection(LineCollection(lines, linewidths=widths, colors=INK, capstyle="round"))
         axis.text(1.0, -0.09, f"line width proportional to the normal force, 2.5 points: {thickest:.2g} N/m",
                   transform=axis.transAxes, ha="right", va="top", fontsize=8, color=INK)
 
@@ -163,9 +164,9 @@ def _discs(axis, position, radius, period, value, **options):
 
 
 def _branches(sim, position, period):
-    """Segments (n, 2, 2) [m] from centre to centre, or to the wall, and their normal forces (n,) [N/m].
+    """Segments (n, 2, 2) [m] from centre to centre, and their normal forces (n,) [N/m].
 
-    A segment that leaves the period is drawn from both of its ends.
+    At a wall or a grain fixed to one they end in the contact. A segment that leaves the period is drawn from both ends.
     """
     contacts = sim.contacts()
     loaded = contacts["force_normal"] > 0

@@ -36,7 +36,7 @@ class Run:
         self.samples = 0  # steps made so far
         self.wall_time = 0.0  # spent in stepping [s]
         self.interrupted = False
-        self._series = {}  # name: (steps,) array, filled up to `samples`
+        self._series = {}  # name: array that doubles when full; NaN where nothing was recorded
 
     def __iter__(self):
         in_main_thread = threading.current_thread() is threading.main_thread()  # only there can signals be caught
@@ -61,9 +61,12 @@ class Run:
     def record(self, **values):
         """Put scalars into the sample of the step just made."""
         for name, value in values.items():
-            if name not in self._series:
-                self._series[name] = np.full(self.steps, np.nan)
-            self._series[name][self.samples - 1] = value
+            column = self._series.get(name)
+            if column is None:
+                column = self._series[name] = np.full(1024, np.nan)
+            while self.samples > column.size:
+                column = self._series[name] = np.concatenate([column, np.full(column.size, np.nan)])
+            column[self.samples - 1] = value
 
     def __getitem__(self, name):
         """Series of a recorded quantity, (samples,) array."""
