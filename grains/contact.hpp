@@ -5,10 +5,12 @@
 
 namespace quicksand {
 
-template <int dim>
+// Real: double, or in 2D four contacts side by side (wide.hpp).
+template <int dim, class Real = double>
 struct Impulse {
-  double n = 0.0;                          // >= 0, pushes apart [N s] (2D: N s/m)
-  Tangent<dim> t = zero<Tangent<dim>>();   // friction [N s]
+  using T = std::conditional_t<dim == 2, Real, Tangent<dim>>;
+  Real n{};           // >= 0, pushes apart [N s] (2D: N s/m)
+  T t = zero<T>();    // friction [N s]
 };
 
 // A contact that the solver sees: n points from body i to body j, u = velocity of j relative to i at the contact.
@@ -38,7 +40,16 @@ struct WallContact {
   int pair;
 };
 
-inline double clip(double t, double bound) { return std::clamp(t, -bound, bound); }
+template <class Real>
+Real positive(Real x) {
+  return x > 0.0 ? x : Real{};
+}
+
+template <class Real>
+Real clip(Real t, Real bound) {
+  t = t < bound ? t : bound;
+  return t > -bound ? t : -bound;
+}
 inline Vec<3> clip(const Vec<3>& t, double bound) {
   const double norm2 = t.squaredNorm();
   return norm2 <= bound * bound ? t : Vec<3>(t * (bound / std::sqrt(norm2)));
@@ -46,13 +57,14 @@ inline Vec<3> clip(const Vec<3>& t, double bound) {
 
 // Signorini-Coulomb at one contact, the others held: M. Jean, CMAME 177 (1999), eqs. for a diagonal local block.
 //   0 <= u_n + b_n  perp  p_n >= 0,   |p_t| <= mu p_n,  p_t opposite to u_t when sliding
-// step_n = omega/W_nn, step_t = omega/W_tt; omega = 1 solves the contact exactly.
-template <int dim>
-Impulse<dim> obey_coulomb(const Impulse<dim>& p, double u_n, const Tangent<dim>& u_t, double step_n, double step_t,
-                          double friction) {
-  Impulse<dim> next;
-  next.n = std::max(p.n - step_n * u_n, 0.0);
-  next.t = clip(p.t - step_t * u_t, friction * next.n);
+// u_n holds b_n already; step_n = omega/W_nn, step_t = omega/W_tt; omega = 1 solves the contact exactly.
+template <int dim, class Real = double>
+Impulse<dim, Real> obey_coulomb(const Impulse<dim, Real>& p, Real u_n, const typename Impulse<dim, Real>::T& u_t, Real step_n,
+                                Real step_t, Real friction) {
+  using T = typename Impulse<dim, Real>::T;
+  Impulse<dim, Real> next;
+  next.n = positive(p.n - step_n * u_n);
+  next.t = clip(T(p.t - step_t * u_t), friction * next.n);
   return next;
 }
 

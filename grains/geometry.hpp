@@ -42,10 +42,10 @@ using Tangent = typename Rotation<dim>::Tangent;
 
 template <class T>
 T zero() {
-  if constexpr (std::is_same_v<T, double>)
-    return 0.0;
-  else
+  if constexpr (std::is_same_v<T, Vec<3>>)
     return T::Zero();
+  else
+    return T{};
 }
 
 inline double squared(double t) { return t * t; }

@@ -263,7 +263,7 @@ void bind(py::module_& m, const char* suffix) {
                     [](Sim& s, int v) {
                       if (v < 1) throw std::invalid_argument(fmt::format("threads: must be >= 1, got {}", v));
                       s.settings.threads = v;
-                    }, "results do not depend on it, bit for bit");
+                    }, "at most; fewer where more would be slower. Results do not depend on it, bit for bit");
 }
 
 template <int dim>

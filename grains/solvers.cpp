@@ -1,6 +1,8 @@
 // Sweeps over contacts. Sums are kept per block and added in the order of the blocks: the same for any number of threads.
 #include "solvers.hpp"
 
+#include "wide.hpp"
+
 #include <limits>
 #include <numeric>
 
@@ -133,30 +135,20 @@ class Sweeper {
   // W_nn |dp|^2 <= energy, and W_nn |dp| <= speed.
   void settle(double energy, double speed) { settled_energy_ = energy, settled_speed2_ = speed * speed; }
 
-  // To be called by all threads of a team; ends with a barrier after which sums() holds.
+  // To be called by all threads of a team; ends with a barrier after which the sums hold.
   void pass(Pass what, double omega) {
     for (std::size_t colour = 0; colour + 1 < p_.colours.size(); ++colour) {
 #pragma omp for schedule(static)
       for (int b = p_.colours[colour]; b < p_.colours[colour + 1]; ++b) sums_[b] = block(what, b, omega);
     }
 #pragma omp single
-    {
-      total_ = {};
-      for (std::size_t k = 0; k < p_.wall_contacts.size(); ++k) {
-        WallContact<dim>& c = p_.wall_contacts[k];
-        const Tangent<dim>* bias_t = p_.wall_bias_t.empty() ? nullptr : &p_.wall_bias_t[k];
-        if (what == Pass::residual)
-          residual<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, bias_t, total_);
-        else
-          total_ += update<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, bias_t, p_.spin_ratio, omega);
-      }
-      for (const Sums& s : sums_) total_ += s;
-      if (what != Pass::residual) {
-        ++sweeps_;
-        updates_ += total_.updates + static_cast<long>(p_.wall_contacts.size());
-        unsettled_ = std::accumulate(p_.unsettled_count.begin(), p_.unsettled_count.end(), 0L);
-      }
-    }
+    finish(what, omega);
+  }
+
+  // The same, by one thread: blocks are sorted by colour, so the result is the same.
+  void pass_alone(Pass what, double omega) {
+    for (int b = 0; b < static_cast<int>(p_.blocks.size()); ++b) sums_[b] = block(what, b, omega);
+    finish(what, omega);
   }
 
   // Relative change, or relative residual, of the last pass.
@@ -171,32 +163,109 @@ class Sweeper {
   long updates() const { return updates_; }
 
  private:
+  // What one thread does at the end of a pass: contacts with walls, which share them, and the sums.
+  void finish(Pass what, double omega) {
+    total_ = {};
+    for (std::size_t k = 0; k < p_.wall_contacts.size(); ++k) {
+      WallContact<dim>& c = p_.wall_contacts[k];
+      const Tangent<dim>* bias_t = p_.wall_bias_t.empty() ? nullptr : &p_.wall_bias_t[k];
+      if (what == Pass::residual)
+        residual<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, bias_t, total_);
+      else
+        total_ += update<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, bias_t, p_.spin_ratio, omega);
+    }
+    for (const Sums& s : sums_) total_ += s;
+    if (what != Pass::residual) {
+      ++sweeps_;
+      updates_ += total_.updates + static_cast<long>(p_.wall_contacts.size());
+      unsettled_ = std::accumulate(p_.unsettled_count.begin(), p_.unsettled_count.end(), 0L);
+    }
+  }
+
+  bool unsettled(double change, double speed2) const {
+    return (change > settled_energy_) | (speed2 > settled_speed2_);
+  }
+
+  // contact(0) ... contact(n - 1), four at a time as long as these share no grain.
+  template <class Get, class List>
+  void visit_by_four(int n, Get&& contact, double omega, List&& list, Sums& sums) {
+    Contact<2> idle[4];
+    Body<2> idle_a[4], idle_b[4];
+    for (int lane = 0; lane < 4; ++lane)
+      idle[lane] = {Vec<2>(1, 0), 0.0, 1.0, 0.0, {}, 0, 0}, idle_a[lane] = idle_b[lane] = {Vec<2>(0, 0), 0.0, 1.0};
+    Body<2>* const bodies = p_.bodies.data();
+    Contact<2>* const contacts = p_.contacts.data();
+    FourChanges total;
+    auto update = [&](const Four& four, const int* k, int width) {
+      const FourChanges one = update_four<law != Law::frictionless>(four, p_.spin_ratio, omega);
+      total.change += one.change;
+      total.size += one.size;
+      total.speed2 = total.speed2 > one.speed2 ? total.speed2 : one.speed2;
+      const int moved = bits((one.change > settled_energy_) | (one.speed2 > settled_speed2_));
+      for (int lane = 0; lane < width; ++lane) list(k[lane], moved >> lane & 1);
+    };
+    auto put = [&](Four& four, int lane, int k) {
+      Contact<2>& c = contacts[k];
+      four.contact[lane] = &c, four.a[lane] = bodies + c.i, four.b[lane] = bodies + c.j;
+    };
+    for (int at = 0; at < n;) {
+      Four four;
+      int k[4], width = std::min(4, n - at);
+      for (int lane = 0; lane < width; ++lane) k[lane] = contact(at + lane);
+      if (width == 4 && independent(contacts[k[0]], contacts[k[1]], contacts[k[2]], contacts[k[3]])) {
+        for (int lane = 0; lane < 4; ++lane) put(four, lane, k[lane]);
+        update(four, k, 4);
+      } else {  // where one colour ends and the next begins
+        auto shared = [&](int a, int b) {
+          const Contact<2>&c = contacts[k[a]], &d = contacts[k[b]];
+          return c.i == d.i || c.i == d.j || c.j == d.i || c.j == d.j;
+        };
+        for (int lane = 1; lane < width; ++lane)
+          for (int before = 0; before < lane && before < width; ++before)
+            if (lane < width && shared(lane, before)) width = lane;
+        for (int lane = 0; lane < 4; ++lane) {
+          if (lane < width)
+            put(four, lane, k[lane]);
+          else
+            four.contact[lane] = &idle[lane], four.a[lane] = &idle_a[lane], four.b[lane] = &idle_b[lane];
+        }
+        update(four, k, width);
+      }
+      at += width;
+    }
+    for (int lane = 0; lane < 4; ++lane) sums += Change{total.change[lane], total.size[lane], total.speed2[lane]};
+  }
+
   Sums block(Pass what, int b, double omega) {
     Sums sums;
     const int first = p_.blocks[b].begin, end = first + p_.count[b];
     Body<dim>* const bodies = p_.bodies.data();
     Contact<dim>* const contacts = p_.contacts.data();
-    const double spin_ratio = p_.spin_ratio;
     auto bias_t = [&](int k) { return law == Law::coulomb_restitution ? &p_.bias_t[k] : nullptr; };
-    auto update_one = [&](int k) {
-      Contact<dim>& c = contacts[k];
-      const Change change = update<law, dim>(bodies[c.i], bodies[c.j], c, bias_t(k), spin_ratio, omega);
-      sums += change;
-      return (change.change > settled_energy_) | (change.speed2 > settled_speed2_);
-    };
     int n_unsettled = 0;
     auto list = [&](int k, bool moved) {
       p_.unsettled[first + n_unsettled] = k;
       n_unsettled += moved;
     };
+    auto visit = [&](int n, auto&& contact) {
+      sums.updates = n;
+      if constexpr (dim == 2 && law != Law::coulomb_restitution) {
+        visit_by_four(n, contact, omega, list, sums);
+      } else {
+        for (int a = 0; a < n; ++a) {
+          const int k = contact(a);
+          Contact<dim>& c = contacts[k];
+          const Change change = update<law, dim>(bodies[c.i], bodies[c.j], c, bias_t(k), p_.spin_ratio, omega);
+          sums += change;
+          list(k, unsettled(change.change, change.speed2));
+        }
+      }
+      p_.unsettled_count[b] = n_unsettled;
+    };
     if (what == Pass::all) {
-      for (int k = first; k < end; ++k) list(k, update_one(k));
-      p_.unsettled_count[b] = n_unsettled;
-      sums.updates = p_.count[b];
+      visit(p_.count[b], [&](int a) { return first + a; });
     } else if (what == Pass::unsettled) {
-      sums.updates = p_.unsettled_count[b];
-      for (int a = first; a < first + p_.unsettled_count[b]; ++a) list(p_.unsettled[a], update_one(p_.unsettled[a]));
-      p_.unsettled_count[b] = n_unsettled;
+      visit(p_.unsettled_count[b], [&](int a) { return p_.unsettled[first + a]; });
     } else {
       for (int k = first; k < end; ++k) {
         const Contact<dim>& c = contacts[k];
@@ -214,6 +283,9 @@ class Sweeper {
   long updates_ = 0, unsettled_ = 0;
 };
 
+// Fewer contacts than that are swept sooner by one thread than several can meet at the ends of the colours.
+constexpr long worth_sharing = 2000;
+
 // Sweeps until the residual is below the tolerance. The change of the impulses in a sweep over all contacts tells when the
 // residual is worth its pass.
 template <Law law, int dim>
@@ -229,8 +301,12 @@ SolveReport relax(Problem<dim>& problem, const SolverSettings& settings, bool ac
   const long contacts = std::accumulate(problem.count.begin(), problem.count.end(), 1L);
 #pragma omp parallel num_threads(problem.threads)
   while (next != Next::done) {
-    if (next == Next::active)
-      for (int k = 0; k < settings.active_sweeps && sweeper.unsettled() > 0; ++k) sweeper.pass(Pass::unsettled, omega);
+    if (next == Next::active) {
+      int k = 0;
+      for (; k < settings.active_sweeps && sweeper.unsettled() > worth_sharing; ++k) sweeper.pass(Pass::unsettled, omega);
+#pragma omp single
+      for (; k < settings.active_sweeps && sweeper.unsettled() > 0; ++k) sweeper.pass_alone(Pass::unsettled, omega);
+    }
     sweeper.pass(next == Next::check ? Pass::residual : Pass::all, omega);
 #pragma omp single
     {
