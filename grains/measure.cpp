@@ -1,14 +1,15 @@
 #include "measure.hpp"
 
+#include "errors.hpp"
+
 #include <complex>
-#include <stdexcept>
 
 namespace quicksand {
 
 template <int dim>
 Profile<dim> profile(const Simulation<dim>& simulation, int axis, double low, double high, int bins) {
   if (axis < 0 || axis >= dim || !(high > low) || bins < 1)
-    throw std::invalid_argument("profile: needs an axis of the scene, low < high [m] and at least one bin");
+    fail("profile: needs an axis of the scene, low < high [m] and at least one bin, got axis {}, {} to {} m, {} bins", axis, low, high, bins);
   const Grains<dim>& grains = simulation.grains();
   Profile<dim> out;
   out.solid.assign(bins, 0.0);
@@ -20,9 +21,10 @@ Profile<dim> profile(const Simulation<dim>& simulation, int axis, double low, do
     const double r = grains.r[k], y = simulation.box().wrap(grains.x[k])[axis];
     const int first = std::max(0, static_cast<int>(std::floor((y - r - low) / thickness)));
     const int last = std::min(bins - 1, static_cast<int>(std::floor((y + r - low) / thickness)));
-    double below = first <= last ? solid_below<dim>(r, low + first * thickness - y) : 0.0;
+    double below = y - r < low ? solid_below<dim>(r, low - y) : 0.0;
     for (int b = first; b <= last; ++b) {
-      const double next = solid_below<dim>(r, low + (b + 1) * thickness - y);
+      const double top = low + (b + 1) * thickness;
+      const double next = y + r <= top ? solid_volume<dim>(r) : solid_below<dim>(r, top - y);
       const Vec<dim>& v = grains.body[k].v;
       out.solid[b] += next - below;
       out.momentum[b] += (next - below) * v;

@@ -307,8 +307,16 @@ void Neighbours<dim>::find(Grains<dim>& grains, std::vector<Wall<dim>>& walls, c
 }
 
 template <int dim>
-bool Neighbours<dim>::valid(const Grains<dim>& grains, const std::vector<Wall<dim>>& walls, double reach, int threads) {
-  if (skin_ < 0) return false;
+bool Neighbours<dim>::valid(const Grains<dim>& grains, const std::vector<Wall<dim>>& walls, double reach, double h,
+                            int threads) {
+  if (grains.size() == 0) return true;
+  return skin_ >= 0 && within(grains, walls, reach, 0.0, threads) && (h == 0 || within(grains, walls, reach, h, threads));
+}
+
+// Whether the ways since neighbours were found, and for another time h, are too alike for an unlisted pair to come within reach.
+template <int dim>
+bool Neighbours<dim>::within(const Grains<dim>& grains, const std::vector<Wall<dim>>& walls, double reach, double h,
+                             int threads) {
   const int n_cells = static_cast<int>(cell_start_.size()) - 1;
   cell_mean_.resize(n_cells);
   cell_spread_.resize(n_cells);
@@ -316,10 +324,11 @@ bool Neighbours<dim>::valid(const Grains<dim>& grains, const std::vector<Wall<di
   for (int c = 0; c < n_cells; ++c) {
     const int begin = cell_start_[c], end = cell_start_[c + 1];
     Vec<dim> mean = Vec<dim>::Zero();
-    for (int i = begin; i < end; ++i) mean += grains.x[i] - x_found_[i];
+    auto way = [&](int i) -> Vec<dim> { return grains.x[i] - x_found_[i] + h * grains.body[i].v; };
+    for (int i = begin; i < end; ++i) mean += way(i);
     if (end > begin) mean /= end - begin;
     double spread2 = 0.0;
-    for (int i = begin; i < end; ++i) spread2 = std::max(spread2, (grains.x[i] - x_found_[i] - mean).squaredNorm());
+    for (int i = begin; i < end; ++i) spread2 = std::max(spread2, (way(i) - mean).squaredNorm());
     cell_mean_[c] = mean;
     cell_spread_[c] = std::sqrt(spread2);
   }
@@ -361,7 +370,8 @@ bool Neighbours<dim>::valid(const Grains<dim>& grains, const std::vector<Wall<di
   if (nearing + reach > skin_) return false;
   for (std::size_t w = 0; w < walls.size(); ++w)
     for (int c = 0; c < n_cells; ++c) {
-      const Vec<dim> way = cell_mean_[c] - walls[w].moved;
+      if (cell_start_[c] == cell_start_[c + 1]) continue;
+      const Vec<dim> way = cell_mean_[c] - walls[w].moved - h * walls[w].v;
       const double towards = walls[w].shape == Wall<dim>::Shape::plane ? -way.dot(walls[w].normal) : way.norm();
       if (towards + cell_spread_[c] + reach > cell_wall_gap_[w * n_cells + c]) return false;
     }

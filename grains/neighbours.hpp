@@ -52,8 +52,9 @@ class Neighbours {
   // Sorts the grains, lists every pair with a gap below `skin` [m], keeps the impulses of pairs already known.
   void find(Grains<dim>& grains, std::vector<Wall<dim>>& walls, const Box<dim>& box, double skin, int threads);
 
-  // True when no unlisted pair can be nearer than `reach` [m] now: a bound, never an estimate.
-  bool valid(const Grains<dim>& grains, const std::vector<Wall<dim>>& walls, double reach, int threads);
+  // True when no unlisted pair can be nearer than `reach` [m] now, nor after all have moved for `h` [s] with their present velocity:
+  // a bound, never an estimate.
+  bool valid(const Grains<dim>& grains, const std::vector<Wall<dim>>& walls, double reach, double h, int threads);
 
   void forget() { skin_ = -1.0; }  // grains or walls were added or moved from outside
 
@@ -61,6 +62,7 @@ class Neighbours {
   void sort(Grains<dim>& grains, const Box<dim>& box);
   void list(const Grains<dim>& grains, const std::vector<Wall<dim>>& walls, const Box<dim>& box, int threads);
   void arrange(int grains, int threads);
+  bool within(const Grains<dim>& grains, const std::vector<Wall<dim>>& walls, double reach, double h, int threads);
 
   struct Found {
     std::vector<Pair<dim>> pairs;

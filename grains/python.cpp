@@ -1,7 +1,7 @@
 // quicksand.grains in Python: numpy arrays in, numpy arrays out, grains in the order of adding.
+#include "errors.hpp"
 #include "measure.hpp"
 
-#include <fmt/format.h>
 #include <omp.h>
 #include <pybind11/eigen.h>
 #include <pybind11/numpy.h>
@@ -22,8 +22,8 @@ std::span<const T> as_span(const Array& a, const char* where, const char* what) 
   constexpr int width = sizeof(T) / sizeof(double);
   const bool fits = width == 1 ? a.ndim() == 1 : (a.ndim() == 2 && a.shape(1) == width);
   if (!fits)
-    throw std::invalid_argument(fmt::format("{}: {} must be an array of shape {}", where, what,
-                                            width == 1 ? std::string("(n,)") : fmt::format("(n, {})", width)));
+    fail("{}: {} must be an array of shape {}", where, what,
+                                            width == 1 ? std::string("(n,)") : fmt::format("(n, {})", width));
   return {reinterpret_cast<const T*>(a.data()), static_cast<std::size_t>(a.shape(0))};
 }
 
@@ -53,11 +53,11 @@ WallHandle<dim> driven(py::object self, int number, const PerAxis& velocity, con
   auto* simulation = self.cast<Simulation<dim>*>();
   for (const auto* axes : {&velocity, &load})
     if (*axes && (*axes)->size() != dim)
-      throw std::invalid_argument(fmt::format("wall: velocity and load need one entry per axis ({}), None where not driven", dim));
+      fail("wall: velocity and load need one entry per axis ({}), None where not driven", dim);
   for (int k = 0; k < dim; ++k) {
     const bool by_velocity = velocity && (*velocity)[k], by_load = load && (*load)[k];
     if (by_velocity && by_load)
-      throw std::invalid_argument(fmt::format("wall: axis {} is driven by velocity and by load; give one of them", k));
+      fail("wall: axis {} is driven by velocity and by load; give one of them", k);
     if (by_load) simulation->load(number, k, *(*load)[k], mass);
     else simulation->drive(number, k, by_velocity ? *(*velocity)[k] : 0.0);
   }
@@ -67,13 +67,13 @@ WallHandle<dim> driven(py::object self, int number, const PerAxis& velocity, con
 Solver solver_named(const std::string& name) {
   if (name == "nlgs") return Solver::nlgs;
   if (name == "active_set") return Solver::active_set;
-  throw std::invalid_argument(fmt::format("Simulation: solver must be 'active_set' or 'nlgs', got '{}'", name));
+  fail("Simulation: solver must be 'active_set' or 'nlgs', got '{}'", name);
 }
 
 SubSteps sub_steps_named(const std::string& name) {
   if (name == "relative") return SubSteps::relative;
   if (name == "absolute") return SubSteps::absolute;
-  throw std::invalid_argument(fmt::format("Simulation: sub_step_rule must be 'relative' or 'absolute', got '{}'", name));
+  fail("Simulation: sub_step_rule must be 'relative' or 'absolute', got '{}'", name);
 }
 
 template <int dim>
@@ -116,14 +116,8 @@ void bind(py::module_& m, const char* suffix) {
       .def_property_readonly("load", [](const Handle& h) { return h.wall().load; }, "(dim,) [N] (2D: N/m)")
       .def_property_readonly("mass", [](const Handle& h) { return h.wall().mass; },
                              "of load-driven axes [kg] (2D: kg/m); 0: set at the first step")
-      .def("drive", [](const Handle& h, int axis, double velocity) {
-             if (axis < 0 || axis >= dim) throw std::invalid_argument(fmt::format("drive: no axis {}", axis));
-             h.simulation->drive(h.number, axis, velocity);
-           }, "axis"_a, "velocity"_a, "From now on drive an axis by velocity [m/s].")
-      .def("set_load", [](const Handle& h, int axis, double load) {
-             if (axis < 0 || axis >= dim) throw std::invalid_argument(fmt::format("set_load: no axis {}", axis));
-             h.simulation->load(h.number, axis, load, std::nullopt);
-           }, "axis"_a, "load"_a, "From now on drive an axis by load [N] (2D: N/m).");
+      .def("drive", [](const Handle& h, int axis, double velocity) { h.simulation->drive(h.number, axis, velocity); }, "axis"_a, "velocity"_a, "From now on drive an axis by velocity [m/s].")
+      .def("set_load", [](const Handle& h, int axis, double load) { h.simulation->load(h.number, axis, load, std::nullopt); }, "axis"_a, "load"_a, "From now on drive an axis by load [N] (2D: N/m).");
 
   py::class_<Sim>(m, named("Simulation").c_str(), "A scene of grains and walls; made by Simulation(dim=...).")
       .def("add",
@@ -223,32 +217,32 @@ void bind(py::module_& m, const char* suffix) {
            }, "force"_a, "External force on each grain from now on, (n, dim) [N] (2D: N/m); None: none.")
       .def_property("tolerance", [](const Sim& s) { return s.settings.solve.tolerance; },
                     [](Sim& s, double v) {
-                      if (!(v > 0)) throw std::invalid_argument(fmt::format("tolerance: must be > 0, got {}", v));
+                      if (!(v > 0)) fail("tolerance: must be > 0, got {}", v);
                       s.settings.solve.tolerance = v;
                     }, "of every sub-step, on the residual [-]; no contact may be wrong by more than tolerance/20 mean diameters")
       .def_property("max_sweeps", [](const Sim& s) { return s.settings.solve.max_sweeps; },
                     [](Sim& s, int v) {
-                      if (v < 1) throw std::invalid_argument(fmt::format("max_sweeps: must be >= 1, got {}", v));
+                      if (v < 1) fail("max_sweeps: must be >= 1, got {}", v);
                       s.settings.solve.max_sweeps = v;
                     }, "before the fallback, and again as many for it")
       .def_property("omega", [](const Sim& s) { return s.settings.solve.omega; },
                     [](Sim& s, double v) {
-                      if (!(v >= 1 && v < 2)) throw std::invalid_argument(fmt::format("omega: must be in [1, 2), got {}", v));
+                      if (!(v >= 1 && v < 2)) fail("omega: must be in [1, 2), got {}", v);
                       s.settings.solve.omega = v;
                     }, "over-relaxation to start from [-]")
       .def_property("active_sweeps", [](const Sim& s) { return s.settings.solve.active_sweeps; },
                     [](Sim& s, int v) {
-                      if (v < 1) throw std::invalid_argument(fmt::format("active_sweeps: must be >= 1, got {}", v));
+                      if (v < 1) fail("active_sweeps: must be >= 1, got {}", v);
                       s.settings.solve.active_sweeps = v;
                     }, "over unsettled contacts between sweeps over all")
       .def_property("sub_step_motion", [](const Sim& s) { return s.settings.sub_step_motion; },
                     [](Sim& s, double v) {
-                      if (!(v > 0 && v <= 0.5)) throw std::invalid_argument(fmt::format("sub_step_motion: must be in (0, 0.5], got {}", v));
+                      if (!(v > 0 && v <= 0.5)) fail("sub_step_motion: must be in (0, 0.5], got {}", v);
                       s.settings.sub_step_motion = v;
                     }, "largest motion of a pair in a sub-step over the distance of its centres [-]")
       .def_property("rest_speed", [](const Sim& s) { return s.settings.rest_speed; },
                     [](Sim& s, double v) {
-                      if (!(v >= 0)) throw std::invalid_argument(fmt::format("rest_speed: must be >= 0 m/s, got {}", v));
+                      if (!(v >= 0)) fail("rest_speed: must be >= 0 m/s, got {}", v);
                       s.settings.rest_speed = v;
                     }, "contacts that approach more slowly do not rebound [m/s]")
       .def_property("solver", [](const Sim& s) { return s.settings.solver == Solver::nlgs ? "nlgs" : "active_set"; },
@@ -261,7 +255,7 @@ void bind(py::module_& m, const char* suffix) {
                     "go on after a sub-step that missed its tolerance; such sub-steps are counted in the report")
       .def_property("threads", [](const Sim& s) { return s.settings.threads; },
                     [](Sim& s, int v) {
-                      if (v < 1) throw std::invalid_argument(fmt::format("threads: must be >= 1, got {}", v));
+                      if (v < 1) fail("threads: must be >= 1, got {}", v);
                       s.settings.threads = v;
                     }, "at most; fewer where more would be slower. Results do not depend on it, bit for bit");
 }
@@ -271,12 +265,12 @@ py::object make(const std::optional<std::vector<std::optional<double>>>& period,
   Vec<dim> lengths = Vec<dim>::Zero();
   if (period) {
     if (period->size() != dim)
-      throw std::invalid_argument(fmt::format("Simulation: period needs one entry per axis ({}), None where not periodic", dim));
+      fail("Simulation: period needs one entry per axis ({}), None where not periodic", dim);
     for (int k = 0; k < dim; ++k) lengths[k] = (*period)[k].value_or(0.0);
   }
   auto simulation = std::make_unique<Simulation<dim>>(lengths);
   if (!gravity.is_none()) simulation->gravity = gravity.cast<Vec<dim>>();
-  if (!simulation->gravity.allFinite()) throw std::invalid_argument("Simulation: gravity [m/s^2] must be finite");
+  if (!simulation->gravity.allFinite()) fail("Simulation: gravity [m/s^2] must be finite");
   simulation->settings.threads = omp_get_max_threads();
   return py::cast(std::move(simulation));
 }
@@ -305,14 +299,14 @@ PYBIND11_MODULE(_grains, m) {
       "Simulation",
       [](int dim, const std::optional<std::vector<std::optional<double>>>& period, const py::object& gravity,
          const py::kwargs& settings) {
-        if (dim != 2 && dim != 3) throw std::invalid_argument(fmt::format("Simulation: dim must be 2 or 3, got {}", dim));
+        if (dim != 2 && dim != 3) fail("Simulation: dim must be 2 or 3, got {}", dim);
         py::object simulation = dim == 2 ? make<2>(period, gravity) : make<3>(period, gravity);
         for (const auto& [name, value] : settings) {
           static const std::vector<std::string> known{"threads", "tolerance", "solver", "max_sweeps", "omega", "active_sweeps",
                                                       "sub_step_motion", "sub_step_rule", "rest_speed", "accept_unconverged"};
           if (std::find(known.begin(), known.end(), name.cast<std::string>()) == known.end())
-            throw std::invalid_argument(fmt::format("Simulation: unknown setting '{}', known: {}", name.cast<std::string>(),
-                                                    fmt::join(known, ", ")));
+            fail("Simulation: unknown setting '{}', known: {}", name.cast<std::string>(),
+                                                    fmt::join(known, ", "));
           if (!value.is_none()) py::setattr(simulation, name, value);
         }
         return simulation;

@@ -112,7 +112,8 @@ class Simulation {
 
  private:
   struct Motion {
-    double speed = 0.0;   // largest approach of a pair or of a grain and a wall [m/s]
+    double speed = 0.0;       // largest of a grain relative to a neighbour [m/s]
+    double wall_speed = 0.0;  // largest of a grain relative to a wall near it, across it where it is a plane [m/s]
     double rate = 0.0;    // largest speed of a pair over the distance of its centres [1/s]
     double overlap = 0.0; // [m]
   };
@@ -128,14 +129,14 @@ class Simulation {
   Motion measure_pairs();
   void repair_overlaps(double allowed);
   double sub_step_length(double left, double dt, const Motion& motion) const;
-  void find_contacts(double h, double alert);
+  void find_contacts(double h, double alert, double wall_alert);
   SolveReport solve_contacts(double h);
   bool rebound();
   void accelerate(double h);
   void account(double h, StepReport<dim>& report);
   void move(double h);
   void set_by_id(std::size_t size, const char* where, const char* what) const;
-  void check_wall(int wall, const char* where) const;
+  void check_wall(int wall, const char* where, int axis = 0) const;
 
   Box<dim> box_;
   Grains<dim> grains_;
@@ -153,7 +154,7 @@ class Simulation {
     int samples[2] = {0, 0};
     int steps = 0;
   } pace_;
-  double mean_radius_ = 0.0, acceleration_ = 0.0;
+  double mean_radius_ = 0.0, max_radius_ = 0.0, acceleration_ = 0.0;
   bool friction_ = false, restitution_ = false, tangential_restitution_ = false;
   std::vector<double> gap_;
   std::vector<Contact<dim>> contacts_;

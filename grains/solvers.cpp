@@ -313,7 +313,8 @@ SolveReport relax(Problem<dim>& problem, const SolverSettings& settings, bool ac
       if (next == Next::check) {
         report.residual = sweeper.relative();
         report.worst = sweeper.worst();
-        report.converged = report.residual <= settings.tolerance && report.worst <= settings.worst;
+        report.converged = (report.residual <= settings.tolerance && report.worst <= settings.worst) ||
+                           report.worst <= settings.rounding;  // contacts that only just touch: impulses of the size of their errors
         const bool out_of_sweeps = sweeper.sweeps() >= limit;
         if (report.converged || (out_of_sweeps && fallen_back)) {
           next = Next::done;

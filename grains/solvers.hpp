@@ -31,6 +31,7 @@ struct Problem {
 struct SolverSettings {
   double tolerance = 1e-2;   // on the residual [-]
   double worst = std::numeric_limits<double>::infinity();  // on W_nn |e| of every contact [m/s]
+  double rounding = 0.0;     // W_nn |e| that velocities in double precision cannot tell from 0 [m/s]
   int max_sweeps = 1000;     // over the contacts, then as many again by the fallback
   int active_sweeps = 6;     // over contacts that have not settled, after each sweep over all
   double omega = 1.5;        // over-relaxation to start from [-]

@@ -13,7 +13,7 @@ class Profile:
     height: float  # mean height [m]
     solid_fraction: np.ndarray  # (bins,) [-]
     velocity: np.ndarray  # (bins, dim) mean over solid area or volume [m/s]
-    temperature: np.ndarray  # (bins, dim) <v^2> - <v>^2 per component, the shear across one grain included [m^2/s^2]
+    temperature: np.ndarray  # (bins, dim) about the mean of the bin at each time, per component, the shear across one bin included [m^2/s^2]
 
     def shear_rate(self):
         """Slope of <v_x> over the middle half of the height by least squares [1/s]; None with fewer than two bins."""
@@ -49,10 +49,12 @@ class Profiles:
         if not chosen:
             return None
         heights = [height for height, _ in chosen]
-        solid, momentum, second = (sum(profile[name] for _, profile in chosen) for name in ("solid", "momentum", "second"))
+        solid, momentum = (sum(profile[name] for _, profile in chosen) for name in ("solid", "momentum"))
         height = float(np.mean(heights))
         with np.errstate(invalid="ignore", divide="ignore"):
             velocity = momentum / solid[:, None]
-            temperature = second / solid[:, None] - velocity**2
+            # About the mean of each sample: layers speed up and slow down as a whole, which is no heat.
+            heat = sum(np.nan_to_num(p["second"] - p["momentum"]**2 / p["solid"][:, None]) for _, p in chosen)
+            temperature = heat / solid[:, None]
         volume = self.cross_section * sum(heights) / self.bins
         return Profile((np.arange(self.bins) + 0.5) * height / self.bins, height, solid / volume, velocity, temperature)

@@ -31,6 +31,13 @@ def test_a_linear_flow_gives_its_rate_solid_fraction_and_temperature():
     assert mean.height == pytest.approx(0.1) and mean.position[0] == pytest.approx(0.1 / 80)
 
 
+def test_a_layer_that_changes_speed_as_a_whole_is_not_hot():
+    flow, profiles = Flow(rate=1.0), Profiles(axis=1, bins=10, cross_section=0.2)
+    for flow.rate in (1.0, 9.0):
+        profiles.sample(flow, -0.05, 0.05)
+    np.testing.assert_allclose(profiles.mean(0.0).temperature, [[4e-4, 1e-4]] * 10, rtol=1e-9)
+
+
 def test_bins_follow_the_walls():
     # The same wall speeds at heights of 0.08 and 0.12 m, solid in proportion to the height (phi the same in both): the mean
     # height is 0.1 m, and the velocity of a bin, U (2 y/h), the same at both times.
