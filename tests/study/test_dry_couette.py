@@ -77,7 +77,7 @@ def test_the_flow_is_that_of_grains(rough):
     assert 0 < results["psi6"] < 0.8 and 0.5 < results["coordination"] < 4
     assert results["energy_error"] < 1e-6
     assert results["max_overlap"] < 0.005
-    assert 0.2 <= results["t_converged"] < 2.0
+    assert 0.2 - 1e-9 <= results["t_converged"] < 2.0  # not before a tenth of the time, a sum of time steps
 
 
 def test_the_summary_names_no_reference_for_another_scene(rough):
