@@ -74,7 +74,8 @@ TYPED_TEST(Collisions, a_perfectly_elastic_ball_keeps_its_energy_over_hundreds_o
     sim.step(1e-3);
     bounces += before * velocities(sim)[0][1] < 0;
   }
-  EXPECT_NEAR(bounces, 500, 50);  // one per way of 2 r and the fraction of a step that is not used up: 20 steps + 0.5
+  EXPECT_GE(bounces, 499);  // a way of 2 r is 20 steps long, less what it turns short of each wall: up to one step
+  EXPECT_LE(bounces, 556);
   EXPECT_NEAR(std::abs(velocities(sim)[0][1]), 1.0, 500 * 1e-9);  // the solver's tolerance in each
 }
 
