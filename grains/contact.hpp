@@ -70,16 +70,26 @@ Impulse<dim, Real> obey_coulomb(const Impulse<dim, Real>& p, Real u_n, const typ
 
 // e = r - P_K(r - rho (w + mu |w_t| n)), K = {|r_t| <= mu r_n}, rho = 1/W_nn: zero exactly when the contact obeys its law.
 // De Saxce and Feng, Math. Comput. Modelling 28 (1998). Returns |e|^2.
-template <int dim>
-double natural_map(const Impulse<dim>& p, double w_n, const Tangent<dim>& w_t, double rho, double friction) {
-  const double z_n = p.n - rho * (w_n + friction * std::sqrt(squared(w_t)));
-  const Tangent<dim> z_t = p.t - rho * w_t;
-  const double norm_t = std::sqrt(squared(z_t));
-  if (norm_t <= friction * z_n) return (p.n - z_n) * (p.n - z_n) + squared(Tangent<dim>(p.t - z_t));
-  if (friction * norm_t <= -z_n) return p.n * p.n + squared(p.t);
-  const double on_cone = (z_n + friction * norm_t) / (1.0 + friction * friction);
-  const double scale = norm_t > 0 ? friction * on_cone / norm_t : 0.0;
-  return (p.n - on_cone) * (p.n - on_cone) + squared(Tangent<dim>(p.t - scale * z_t));
+template <int dim, class Real = double>
+Real natural_map(const Impulse<dim, Real>& p, Real w_n, const typename Impulse<dim, Real>::T& w_t, Real rho, Real friction) {
+  using T = typename Impulse<dim, Real>::T;
+  const Real z_n = p.n - rho * (w_n + friction * length(w_t));
+  const T z_t = p.t - rho * w_t;
+  const Real norm_t = length(z_t);
+  const Real on_cone = positive<Real>((z_n + friction * norm_t) / (1.0 + friction * friction));
+  const auto inside = norm_t <= friction * z_n;  // of K; r_n = 0 where z is in its polar cone
+  const Real r_n = inside ? z_n : on_cone;
+  const Real shrunk = inside ? Real{} + 1.0 : (norm_t > 0.0 ? friction * on_cone / norm_t : Real{});
+  return (p.n - r_n) * (p.n - r_n) + squared(T(p.t - shrunk * z_t));
 }
+
+// What a visit changed at one contact, or how far it is from its law: with dp the change, or e, the natural map.
+template <class Real = double>
+struct Change {
+  Real change{}, size{};  // W_nn |dp|^2, W_nn |p|^2
+  Real speed2{};          // (W_nn |dp|)^2 [m^2/s^2]
+};
+
+enum class Law { frictionless, coulomb, coulomb_restitution };
 
 }  // namespace quicksand

@@ -48,8 +48,17 @@ T zero() {
     return T{};
 }
 
-inline double squared(double t) { return t * t; }
+template <class Real>  // double, or lanes of them (wide.hpp)
+Real squared(const Real& t) {
+  return t * t;
+}
 inline double squared(const Vec<3>& t) { return t.squaredNorm(); }
+
+template <class Real>
+Real length(const Real& t) {
+  return t > 0.0 ? t : -t;
+}
+inline double length(const Vec<3>& t) { return t.norm(); }
 
 inline double inner(double a, double b) { return a * b; }
 inline double inner(const Vec<3>& a, const Vec<3>& b) { return a.dot(b); }

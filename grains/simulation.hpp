@@ -160,7 +160,8 @@ class Simulation {
   std::vector<Contact<dim>> contacts_;
   std::vector<WallContact<dim>> wall_contacts_;
   std::vector<int> pair_of_;  // of each contact: where its impulse is kept between sub-steps
-  std::vector<int> count_, unsettled_, unsettled_count_;
+  std::vector<int> count_;
+  Scratch scratch_;
   std::vector<Tangent<dim>> bias_t_, wall_bias_t_;
   std::vector<Body<dim>> body_before_;
   std::vector<Vec<dim>> wall_before_;

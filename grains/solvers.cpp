@@ -1,8 +1,6 @@
 // Sweeps over contacts. Sums are kept per block and added in the order of the blocks: the same for any number of threads.
 #include "solvers.hpp"
 
-#include "wide.hpp"
-
 #include <limits>
 #include <numeric>
 
@@ -10,20 +8,16 @@ namespace quicksand {
 
 namespace {
 
-enum class Law { frictionless, coulomb, coulomb_restitution };
-
-struct Change {  // of one contact in one update
-  double change = 0.0, size = 0.0;  // W_nn |dp|^2, W_nn |p|^2
-  double speed2 = 0.0;              // (W_nn |dp|)^2 [m^2/s^2]
-};
-
 struct Sums {  // over contacts
   double change = 0.0;  // sum W_nn |dp|^2, or W_nn |e|^2
   double size = 0.0;    // sum W_nn |p|^2
   double worst = 0.0;   // largest (W_nn |dp|)^2, or (W_nn |e|)^2 [m^2/s^2]
   long updates = 0;
-  void operator+=(const Change& one) {
+  void operator+=(const Change<>& one) {
     change += one.change, size += one.size, worst = std::max(worst, one.speed2);
+  }
+  void operator+=(const Change<Lanes>& four) {
+    for (int lane = 0; lane < 4; ++lane) *this += Change<>{four.change[lane], four.size[lane], four.speed2[lane]};
   }
   void operator+=(const Sums& other) {
     change += other.change, size += other.size, updates += other.updates, worst = std::max(worst, other.worst);
@@ -87,7 +81,7 @@ double inv_w_t(const C& c, double rolling) {
 
 // One contact update; a is a Body or a Wall. Inlined by order: called, it costs three times as much.
 template <Law law, int dim, class A, class C>
-[[gnu::always_inline]] inline Change update(A& a, Body<dim>& b, C& c, const Tangent<dim>* bias_t, double spin_ratio,
+[[gnu::always_inline]] inline Change<> update(A& a, Body<dim>& b, C& c, const Tangent<dim>* bias_t, double spin_ratio,
                                           double omega) {
   Slip<dim> u = slip<law, dim>(a, b, c.n);
   u.n += c.bias;
@@ -108,39 +102,58 @@ template <Law law, int dim, class A, class C>
 }
 
 template <Law law, int dim, class A, class C>
-void residual(const A& a, const Body<dim>& b, const C& c, const Tangent<dim>* bias_t, Sums& sums) {
+Change<> error(const A& a, const Body<dim>& b, const C& c, const Tangent<dim>* bias_t) {
   Slip<dim> u = slip<law, dim>(a, b, c.n);
   u.n += c.bias;
-  if (c.p.n == 0.0 && u.n >= 0.0) return;  // open: e = 0
+  if (c.p.n == 0.0 && u.n >= 0.0) return {};  // open: e = 0
   if constexpr (law == Law::coulomb_restitution) u.t += *bias_t;
-  const double e2 = natural_map<dim>(c.p, u.n, u.t, c.inv_w, c.friction);
-  sums.change += e2 / c.inv_w;
-  sums.size += (c.p.n * c.p.n + squared(c.p.t)) / c.inv_w;
-  sums.worst = std::max(sums.worst, e2 / (c.inv_w * c.inv_w));
+  const double w = 1.0 / c.inv_w, change = w * natural_map<dim>(c.p, u.n, u.t, c.inv_w, c.friction);
+  return {change, w * (c.p.n * c.p.n + squared(c.p.t)), w * change};
 }
 
-// What a pass over the contacts does with each.
+// What a pass over the contacts does. Each lists the contacts that have not settled for the next.
 enum class Pass {
-  all,        // update every contact; list those whose impulse has not settled
-  unsettled,  // update the listed ones; drop those that have settled now
+  all,        // update every contact
+  touched,    // those with a grain that listed contacts have moved; the others still solve what they solved before
+  unsettled,  // those listed
   residual,   // measure the error of every contact
 };
 
+// The contacts of a block in the order they are visited, in units: packs of four in 2D, one by one in 3D.
 template <Law law, int dim>
 class Sweeper {
  public:
-  explicit Sweeper(Problem<dim>& problem) : p_(problem), sums_(problem.blocks.size()) {}
+  static constexpr bool wide = dim == 2;
+  static constexpr int unit = wide ? 4 : 1;  // contacts
 
-  // Contacts whose impulse changed by less than this are left out until the next sweep over all:
+  explicit Sweeper(Problem<dim>& problem) : p_(problem), s_(problem.scratch), sums_(problem.blocks.size()) {
+    const std::size_t n_blocks = problem.blocks.size();
+    s_.list.resize(problem.contacts.size());
+    s_.listed.assign(n_blocks, 0);
+    s_.units.assign(problem.count.begin(), problem.count.end());
+    s_.touched.assign(problem.bodies.size(), -1);
+    if constexpr (wide) pack();
+  }
+
+  // Writes the impulses back to where they came from.
+  ~Sweeper() {
+    if constexpr (wide)
+      for (std::size_t b = 0; b < p_.blocks.size(); ++b)
+        for (int k = 0; k < s_.units[b]; ++k)
+          for (int lane = 0; lane < 4; ++lane)
+            if (const int slot = s_.slots[p_.blocks[b].begin + k][lane]; slot >= 0) {
+              const Pack& pack = s_.packs[s_.first[b] + k];
+              p_.contacts[slot].p = {pack.p.n[lane], pack.p.t[lane]};
+            }
+  }
+
+  // Contacts whose impulse changed by less than this are left out until a grain of theirs is touched:
   // W_nn |dp|^2 <= energy, and W_nn |dp| <= speed.
   void settle(double energy, double speed) { settled_energy_ = energy, settled_speed2_ = speed * speed; }
 
   // To be called by all threads of a team; ends with a barrier after which the sums hold.
   void pass(Pass what, double omega) {
-    for (std::size_t colour = 0; colour + 1 < p_.colours.size(); ++colour) {
-#pragma omp for schedule(static)
-      for (int b = p_.colours[colour]; b < p_.colours[colour + 1]; ++b) sums_[b] = block(what, b, omega);
-    }
+    each_block([&](int b) { sums_[b] = block(what, b, omega); });
 #pragma omp single
     finish(what, omega);
   }
@@ -151,18 +164,90 @@ class Sweeper {
     finish(what, omega);
   }
 
+  // Marks the grains that the listed contacts, or walls, will move until the next pass over those touched. One thread.
+  void touch() {
+    std::fill(s_.touched.begin(), s_.touched.end(), 0);
+    for (int b = 0; b < static_cast<int>(p_.blocks.size()); ++b)
+      for (int a = p_.blocks[b].begin; a < p_.blocks[b].begin + s_.listed[b]; ++a) {
+        const auto& c = contact(b, s_.list[a]);
+        if constexpr (wide)
+          for (int lane = 0; lane < 4; ++lane) s_.touched[c.i[lane]] = s_.touched[c.j[lane]] = 1;
+        else
+          s_.touched[c.i] = s_.touched[c.j] = 1;
+      }
+    for (const WallContact<dim>& c : p_.wall_contacts) s_.touched[c.j] = 1;
+  }
+
   // Relative change, or relative residual, of the last pass.
   double relative() const {
     if (total_.change == 0.0) return 0.0;
-    return total_.size > 0.0 ? std::sqrt(total_.change / total_.size) : std::numeric_limits<double>::infinity();
+    return size_ > 0.0 ? std::sqrt(total_.change / size_) : std::numeric_limits<double>::infinity();
   }
   double worst() const { return std::sqrt(total_.worst); }
-  double size() const { return total_.size; }
+  double size() const { return size_; }
   long unsettled() const { return unsettled_; }
   int sweeps() const { return sweeps_; }
   long updates() const { return updates_; }
 
  private:
+  template <class Visit>
+  void each_block(Visit&& visit) {
+    for (std::size_t colour = 0; colour + 1 < p_.colours.size(); ++colour) {
+#pragma omp for schedule(static)
+      for (int b = p_.colours[colour]; b < p_.colours[colour + 1]; ++b) visit(b);
+    }
+  }
+
+  void pack() {
+    const std::size_t n_blocks = p_.blocks.size();
+    s_.slots.resize(p_.contacts.size());
+    s_.first.resize(n_blocks);
+#pragma omp parallel num_threads(p_.threads)
+    each_block([&](int b) { fill_slots(b); });
+    int total = 0;
+    for (std::size_t b = 0; b < n_blocks; ++b) s_.first[b] = total, total += s_.units[b];
+    s_.packs.resize(total);
+    if (law == Law::coulomb_restitution) s_.bias_t.assign(total, Lanes{});
+#pragma omp parallel num_threads(p_.threads)
+    each_block([&](int b) { fill_packs(b); });
+  }
+
+  // Consecutive contacts that share no grain make a pack.
+  void fill_slots(int b) {
+    const int begin = p_.blocks[b].begin;
+    std::array<int, 4>* pack = s_.slots.data() + begin - 1;
+    int lane = 0;
+    for (int k = begin; k < begin + p_.count[b]; ++k) {
+      int &at_i = s_.touched[p_.contacts[k].i], &at_j = s_.touched[p_.contacts[k].j];  // slot of the pack they are in
+      const int current = static_cast<int>(pack - s_.slots.data());
+      if (lane == 0 || at_i == current || at_j == current) *++pack = {-1, -1, -1, -1}, lane = 4;
+      (*pack)[--lane] = k;
+      at_i = at_j = static_cast<int>(pack - s_.slots.data());
+    }
+    s_.units[b] = static_cast<int>(pack + 1 - s_.slots.data()) - begin;
+  }
+
+  void fill_packs(int b) {
+    for (int k = 0; k < s_.units[b]; ++k) {
+      const std::array<int, 4>& slots = s_.slots[p_.blocks[b].begin + k];
+      Pack& pack = s_.packs[s_.first[b] + k];
+      Contact<2> empty = p_.contacts[slots[3]];
+      empty.inv_w = 0.0, empty.p = {};
+      for (int lane = 0; lane < 4; ++lane) {
+        put(pack, lane, slots[lane] < 0 ? empty : p_.contacts[slots[lane]]);
+        if (law == Law::coulomb_restitution && slots[lane] >= 0 && !p_.bias_t.empty())
+          s_.bias_t[s_.first[b] + k][lane] = p_.bias_t[slots[lane]];
+      }
+    }
+  }
+
+  auto& contact(int b, int k) {
+    if constexpr (wide)
+      return s_.packs[s_.first[b] + k];
+    else
+      return p_.contacts[p_.blocks[b].begin + k];
+  }
+
   // What one thread does at the end of a pass: contacts with walls, which share them, and the sums.
   void finish(Pass what, double omega) {
     total_ = {};
@@ -170,114 +255,67 @@ class Sweeper {
       WallContact<dim>& c = p_.wall_contacts[k];
       const Tangent<dim>* bias_t = p_.wall_bias_t.empty() ? nullptr : &p_.wall_bias_t[k];
       if (what == Pass::residual)
-        residual<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, bias_t, total_);
+        total_ += error<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, bias_t);
       else
         total_ += update<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, bias_t, p_.spin_ratio, omega);
     }
     for (const Sums& s : sums_) total_ += s;
-    if (what != Pass::residual) {
-      ++sweeps_;
-      updates_ += total_.updates + static_cast<long>(p_.wall_contacts.size());
-      unsettled_ = std::accumulate(p_.unsettled_count.begin(), p_.unsettled_count.end(), 0L);
-    }
-  }
-
-  bool unsettled(double change, double speed2) const {
-    return (change > settled_energy_) | (speed2 > settled_speed2_);
-  }
-
-  // contact(0) ... contact(n - 1), four at a time as long as these share no grain.
-  template <class Get, class List>
-  void visit_by_four(int n, Get&& contact, double omega, List&& list, Sums& sums) {
-    Contact<2> idle[4];
-    Body<2> idle_a[4], idle_b[4];
-    for (int lane = 0; lane < 4; ++lane)
-      idle[lane] = {Vec<2>(1, 0), 0.0, 1.0, 0.0, {}, 0, 0}, idle_a[lane] = idle_b[lane] = {Vec<2>(0, 0), 0.0, 1.0};
-    Body<2>* const bodies = p_.bodies.data();
-    Contact<2>* const contacts = p_.contacts.data();
-    FourChanges total;
-    auto update = [&](const Four& four, const int* k, int width) {
-      const FourChanges one = update_four<law != Law::frictionless>(four, p_.spin_ratio, omega);
-      total.change += one.change;
-      total.size += one.size;
-      total.speed2 = total.speed2 > one.speed2 ? total.speed2 : one.speed2;
-      const int moved = bits((one.change > settled_energy_) | (one.speed2 > settled_speed2_));
-      for (int lane = 0; lane < width; ++lane) list(k[lane], moved >> lane & 1);
-    };
-    auto put = [&](Four& four, int lane, int k) {
-      Contact<2>& c = contacts[k];
-      four.contact[lane] = &c, four.a[lane] = bodies + c.i, four.b[lane] = bodies + c.j;
-    };
-    for (int at = 0; at < n;) {
-      Four four;
-      int k[4], width = std::min(4, n - at);
-      for (int lane = 0; lane < width; ++lane) k[lane] = contact(at + lane);
-      if (width == 4 && independent(contacts[k[0]], contacts[k[1]], contacts[k[2]], contacts[k[3]])) {
-        for (int lane = 0; lane < 4; ++lane) put(four, lane, k[lane]);
-        update(four, k, 4);
-      } else {  // where one colour ends and the next begins
-        auto shared = [&](int a, int b) {
-          const Contact<2>&c = contacts[k[a]], &d = contacts[k[b]];
-          return c.i == d.i || c.i == d.j || c.j == d.i || c.j == d.j;
-        };
-        for (int lane = 1; lane < width; ++lane)
-          for (int before = 0; before < lane && before < width; ++before)
-            if (lane < width && shared(lane, before)) width = lane;
-        for (int lane = 0; lane < 4; ++lane) {
-          if (lane < width)
-            put(four, lane, k[lane]);
-          else
-            four.contact[lane] = &idle[lane], four.a[lane] = &idle_a[lane], four.b[lane] = &idle_b[lane];
-        }
-        update(four, k, width);
-      }
-      at += width;
-    }
-    for (int lane = 0; lane < 4; ++lane) sums += Change{total.change[lane], total.size[lane], total.speed2[lane]};
+    if (what == Pass::all || what == Pass::residual) size_ = total_.size;
+    unsettled_ = unit * std::accumulate(s_.listed.begin(), s_.listed.end(), 0L);
+    if (what == Pass::residual) return;
+    ++sweeps_;
+    updates_ += unit * total_.updates + static_cast<long>(p_.wall_contacts.size());
   }
 
   Sums block(Pass what, int b, double omega) {
-    Sums sums;
-    const int first = p_.blocks[b].begin, end = first + p_.count[b];
-    Body<dim>* const bodies = p_.bodies.data();
-    Contact<dim>* const contacts = p_.contacts.data();
-    auto bias_t = [&](int k) { return law == Law::coulomb_restitution ? &p_.bias_t[k] : nullptr; };
-    int n_unsettled = 0;
-    auto list = [&](int k, bool moved) {
-      p_.unsettled[first + n_unsettled] = k;
-      n_unsettled += moved;
-    };
-    auto visit = [&](int n, auto&& contact) {
-      sums.updates = n;
-      if constexpr (dim == 2 && law != Law::coulomb_restitution) {
-        visit_by_four(n, contact, omega, list, sums);
-      } else {
-        for (int a = 0; a < n; ++a) {
-          const int k = contact(a);
-          Contact<dim>& c = contacts[k];
-          const Change change = update<law, dim>(bodies[c.i], bodies[c.j], c, bias_t(k), p_.spin_ratio, omega);
-          sums += change;
-          list(k, unsettled(change.change, change.speed2));
-        }
-      }
-      p_.unsettled_count[b] = n_unsettled;
-    };
-    if (what == Pass::all) {
-      visit(p_.count[b], [&](int a) { return first + a; });
-    } else if (what == Pass::unsettled) {
-      visit(p_.unsettled_count[b], [&](int a) { return p_.unsettled[first + a]; });
-    } else {
-      for (int k = first; k < end; ++k) {
-        const Contact<dim>& c = contacts[k];
-        residual<law, dim>(bodies[c.i], bodies[c.j], c, bias_t(k), sums);
-      }
+    int* const list = s_.list.data() + p_.blocks[b].begin;
+    int* end = list;
+    if (what == Pass::touched) {
+      for (int k = 0; k < s_.units[b]; ++k) *end = k, end += any_of(s_.touched.data(), contact(b, k));
+      s_.listed[b] = static_cast<int>(end - list);
+      end = list;
     }
+    const bool all = what == Pass::all || what == Pass::residual;
+    const int n = all ? s_.units[b] : s_.listed[b];
+    using Real = std::conditional_t<wide, Lanes, double>;
+    Change<Real> total;
+    auto visit = [&](auto&& one) {
+      for (int a = 0; a < n; ++a) {
+        const int k = all ? a : list[a];
+        const Change<Real> change = one(contact(b, k), k);
+        total.change += change.change;
+        total.size += change.size;
+        total.speed2 = total.speed2 > change.speed2 ? total.speed2 : change.speed2;
+        *end = k;
+        end += any((change.change > settled_energy_) | (change.speed2 > settled_speed2_));
+      }
+    };
+    Body<dim>* const bodies = p_.bodies.data();
+    if constexpr (wide) {
+      auto bias_t = [&](int k) { return law == Law::coulomb_restitution ? &s_.bias_t[s_.first[b] + k] : nullptr; };
+      if (what == Pass::residual)
+        visit([&](Pack& c, int k) { return error<law>(c, bodies, bias_t(k)); });
+      else
+        visit([&](Pack& c, int k) { return update<law>(c, bodies, bias_t(k), p_.spin_ratio, omega); });
+    } else {
+      auto bias_t = [&](int k) { return law == Law::coulomb_restitution ? &p_.bias_t[p_.blocks[b].begin + k] : nullptr; };
+      if (what == Pass::residual)
+        visit([&](auto& c, int k) { return error<law, dim>(bodies[c.i], bodies[c.j], c, bias_t(k)); });
+      else
+        visit([&](auto& c, int k) { return update<law, dim>(bodies[c.i], bodies[c.j], c, bias_t(k), p_.spin_ratio, omega); });
+    }
+    s_.listed[b] = static_cast<int>(end - list);
+    Sums sums;
+    sums += total;
+    sums.updates = n;
     return sums;
   }
 
   Problem<dim>& p_;
+  Scratch& s_;
   std::vector<Sums> sums_;
   Sums total_;
+  double size_ = 0.0;  // of the last pass over all
   double settled_energy_ = 0.0, settled_speed2_ = 0.0;
   int sweeps_ = 0;
   long updates_ = 0, unsettled_ = 0;
@@ -294,20 +332,22 @@ SolveReport relax(Problem<dim>& problem, const SolverSettings& settings, bool ac
   SolveReport report;
   enum class Next { sweep, active, check, done } next = Next::sweep;
   double omega = active_set ? settings.omega : 1.0;
-  double trial = settings.tolerance;  // change below which the residual is looked at
-  double before = std::numeric_limits<double>::infinity();
+  double trial = settings.tolerance, trial_worst = 2 * settings.worst;  // changes below which the residual is looked at
+  double before = std::numeric_limits<double>::infinity(), before_worst = before;
   int slow = 0, limit = settings.max_sweeps;
   bool fallen_back = !active_set;
   const long contacts = std::accumulate(problem.count.begin(), problem.count.end(), 1L);
 #pragma omp parallel num_threads(problem.threads)
   while (next != Next::done) {
     if (next == Next::active) {
+#pragma omp single
+      sweeper.touch();
       int k = 0;
       for (; k < settings.active_sweeps && sweeper.unsettled() > worth_sharing; ++k) sweeper.pass(Pass::unsettled, omega);
 #pragma omp single
       for (; k < settings.active_sweeps && sweeper.unsettled() > 0; ++k) sweeper.pass_alone(Pass::unsettled, omega);
     }
-    sweeper.pass(next == Next::check ? Pass::residual : Pass::all, omega);
+    sweeper.pass(next == Next::check ? Pass::residual : next == Next::active ? Pass::touched : Pass::all, omega);
 #pragma omp single
     {
       if (next == Next::check) {
@@ -319,8 +359,11 @@ SolveReport relax(Problem<dim>& problem, const SolverSettings& settings, bool ac
         if (report.converged || (out_of_sweeps && fallen_back)) {
           next = Next::done;
         } else {
-          if (report.residual > settings.tolerance)
-            trial = std::min(trial, before) * std::clamp(0.7 * settings.tolerance / report.residual, 0.1, 0.7);
+          auto lower = [](double trial, double seen, double wanted, double error) {
+            return error > wanted ? std::min(trial, seen) * std::clamp(0.7 * wanted / error, 0.1, 0.7) : trial;
+          };
+          trial = lower(trial, before, settings.tolerance, report.residual);
+          trial_worst = lower(trial_worst, before_worst, settings.worst, report.worst);
           next = fallen_back ? Next::sweep : Next::active;
           if (out_of_sweeps) fallen_back = true, omega = 1.0, limit += settings.max_sweeps, next = Next::sweep;
         }
@@ -329,10 +372,10 @@ SolveReport relax(Problem<dim>& problem, const SolverSettings& settings, bool ac
         // Over-relaxation can cycle in dense states: three sweeps in a row that gain less than a fifth halve omega - 1.
         slow = change > 0.8 * before ? slow + 1 : 0;
         if (slow >= 3) omega = omega < 1.1 ? 1.0 : 1.0 + 0.5 * (omega - 1.0), slow = 0;
-        before = change;
+        before = change, before_worst = sweeper.worst();
         // Settled: an equal share of the tolerance in the energy norm, and well below the error allowed to one contact.
         sweeper.settle(settings.tolerance * settings.tolerance * sweeper.size() / static_cast<double>(contacts), 0.3 * settings.worst);
-        next = (change <= trial && sweeper.worst() <= 2 * settings.worst) || sweeper.sweeps() >= limit ? Next::check : (fallen_back ? Next::sweep : Next::active);
+        next = (change <= trial && before_worst <= trial_worst) || sweeper.sweeps() >= limit ? Next::check : (fallen_back ? Next::sweep : Next::active);
       }
     }
   }

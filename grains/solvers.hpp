@@ -4,11 +4,22 @@
 
 #include "contact.hpp"
 #include "neighbours.hpp"
+#include "wide.hpp"
 
 #include <limits>
 #include <span>
 
 namespace quicksand {
+
+// What solvers keep in memory from one problem to the next.
+struct Scratch {
+  std::vector<Pack> packs;                // 2D: the contacts, block by block
+  std::vector<Lanes> bias_t;              // of each pack
+  std::vector<std::array<int, 4>> slots;  // of the contacts of each pack, from the first slot of a block on; -1: empty lane
+  std::vector<int> first, units;          // per block: first pack; packs, or in 3D contacts
+  std::vector<int> list, listed;          // per slot, per block: what has not settled
+  std::vector<int> touched;               // per grain
+};
 
 template <int dim>
 struct Problem {
@@ -21,8 +32,7 @@ struct Problem {
   std::span<WallContact<dim>> wall_contacts;
   std::span<const Tangent<dim>> bias_t;           // tangential restitution e_t u_t^- per slot [m/s]; empty: none
   std::span<const Tangent<dim>> wall_bias_t;
-  std::span<int> unsettled;                       // scratch, one per slot
-  std::span<int> unsettled_count;                 // scratch, one per block
+  Scratch& scratch;
   double spin_ratio;                              // m r^2/I [-]
   bool friction;                                  // false: no contact has any, and nothing turns
   int threads;
@@ -33,13 +43,13 @@ struct SolverSettings {
   double worst = std::numeric_limits<double>::infinity();  // on W_nn |e| of every contact [m/s]
   double rounding = 0.0;     // W_nn |e| that velocities in double precision cannot tell from 0 [m/s]
   int max_sweeps = 1000;     // over the contacts, then as many again by the fallback
-  int active_sweeps = 6;     // over contacts that have not settled, after each sweep over all
+  int active_sweeps = 6;     // over contacts that have not settled, before each over all that these have touched
   double omega = 1.5;        // over-relaxation to start from [-]
 };
 
 struct SolveReport {
-  int sweeps = 0;            // over all contacts or over the unsettled ones
-  long updates = 0;          // contacts visited in these sweeps
+  int sweeps = 0;            // over all contacts or over some
+  long updates = 0;          // contacts visited in these sweeps, in 2D four at a time
   double residual = 0.0;     // |D e|/|D r|, e the natural map, D = sqrt(W_nn) [-]
   double worst = 0.0;        // largest W_nn |e| of one contact: a velocity [m/s]
   bool converged = true;
@@ -49,7 +59,8 @@ struct SolveReport {
 template <int dim>
 SolveReport solve_nlgs(Problem<dim>& problem, const SolverSettings& settings);
 
-// Over-relaxed Gauss-Seidel, a sweep over all contacts followed by several over those whose impulse has not settled yet; the
+// Over-relaxed Gauss-Seidel. A sweep over all contacts, then rounds: several sweeps over those whose impulse has not settled yet,
+// one over those with a grain that these have moved. What is left elsewhere is found when the residual of all is measured. The
 // relaxation falls back towards 1 when progress stalls, then to solve_nlgs.
 template <int dim>
 SolveReport solve_active_set(Problem<dim>& problem, const SolverSettings& settings);

@@ -263,9 +263,7 @@ void Simulation<dim>::find_contacts(double h, double alert, double wall_alert) {
   const int n = static_cast<int>(neighbours_.pairs.size()), n_blocks = static_cast<int>(neighbours_.blocks.size());
   contacts_.resize(n);
   pair_of_.resize(n);
-  unsettled_.resize(n);
   count_.resize(n_blocks);
-  unsettled_count_.resize(n_blocks);
   const double scale = last_h_ > 0 ? h / last_h_ : 0.0;
   last_h_ = h;
 #pragma omp parallel for num_threads(threads_) schedule(static)
@@ -338,8 +336,7 @@ SolveReport Simulation<dim>::solve_contacts(double h) {
       .wall_contacts = wall_contacts_,
       .bias_t = {},
       .wall_bias_t = {},
-      .unsettled = unsettled_,
-      .unsettled_count = unsettled_count_,
+      .scratch = scratch_,
       .spin_ratio = 1.0 / grains_.inertia,
       .friction = friction_,
       .threads = threads_,
@@ -506,7 +503,8 @@ std::size_t Simulation<dim>::memory() const {
   auto bytes = [](const auto& v) { return v.capacity() * sizeof(v[0]); };
   return bytes(grains_.x) + bytes(grains_.body) + bytes(grains_.r) + bytes(grains_.id) + bytes(grains_.wall) +
          bytes(grains_.material) + bytes(grains_.force) + bytes(neighbours_.pairs) + bytes(neighbours_.wall_pairs) +
-         bytes(gap_) + bytes(contacts_) + bytes(pair_of_) + bytes(wall_contacts_) + bytes(unsettled_) + bytes(body_before_) + bytes(bias_t_);
+         bytes(gap_) + bytes(contacts_) + bytes(pair_of_) + bytes(wall_contacts_) + bytes(scratch_.packs) + bytes(scratch_.slots) +
+         bytes(scratch_.list) + bytes(scratch_.touched) + bytes(body_before_) + bytes(bias_t_);
 }
 
 template class Simulation<2>;  // of the members defined here

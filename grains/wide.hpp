@@ -1,11 +1,10 @@
-// Four contacts between discs at a time: one lane each. A single update waits about seventy cycles for its own results, and the
-// processor sees no more than two ahead; four side by side cost little more than one. The law is that of contact.hpp, on lanes.
-// Only for contacts that share no grain: the result is then that of one after the other.
+// Four contacts between discs side by side, one lane each. One contact alone keeps the processor waiting for its own results;
+// four cost little more than one. The law is that of contact.hpp, on lanes.
 #pragma once
 
 #include "contact.hpp"
 
-#ifdef __AVX__
+#ifdef __AVX2__
 #include <immintrin.h>
 #endif
 
@@ -15,14 +14,34 @@ namespace quicksand {
 
 using Lanes = double __attribute__((vector_size(32), may_alias));
 
-// Bit k is set where lane k of a comparison holds.
+// Whether a comparison holds in any lane.
 template <class Mask>
-int bits(const Mask& mask) {
-#ifdef __AVX__
-  return _mm256_movemask_pd(reinterpret_cast<const __m256d&>(mask));
+bool any(const Mask& mask) {
+#ifdef __AVX2__
+  return _mm256_movemask_pd(reinterpret_cast<const __m256d&>(mask)) != 0;
 #else
-  return -static_cast<int>(mask[0] + 2 * mask[1] + 4 * mask[2] + 8 * mask[3]);
+  return (mask[0] | mask[1] | mask[2] | mask[3]) != 0;
 #endif
+}
+inline bool any(int one) { return one != 0; }
+
+// Up to four contacts that share no grain: updating them at once is updating one after the other. They fill the lanes from the
+// last; an empty lane names the grains of the last and has 1/W = 0, so that what it stores changes nothing and is stored first.
+struct Pack {
+  Lanes n_x, n_y;
+  Lanes bias;
+  Lanes inv_w;
+  Lanes friction;
+  Impulse<2, Lanes> p;
+  int i[4], j[4];
+};
+static_assert(sizeof(Pack) == 256);
+
+inline void put(Pack& pack, int lane, const Contact<2>& c) {
+  pack.n_x[lane] = c.n.x(), pack.n_y[lane] = c.n.y();
+  pack.bias[lane] = c.bias, pack.inv_w[lane] = c.inv_w, pack.friction[lane] = c.friction;
+  pack.p.n[lane] = c.p.n, pack.p.t[lane] = c.p.t;
+  pack.i[lane] = c.i, pack.j[lane] = c.j;
 }
 
 struct Quad {
@@ -36,80 +55,75 @@ inline Quad transpose(const Quad& q) {
           __builtin_shufflevector(ab_even, cd_even, 2, 3, 6, 7), __builtin_shufflevector(ab_odd, cd_odd, 2, 3, 6, 7)};
 }
 
-// Up to four contacts that share no grain, and the bodies they act on. Unused lanes point to contacts and bodies of their own.
-struct Four {
-  Contact<2>* contact[4];
-  Body<2>*a[4], *b[4];
-};
+inline Lanes& row(Body<2>& b) { return reinterpret_cast<Lanes&>(b); }
 
-// Whether four contacts share no grain.
-inline bool independent(const Contact<2>& c0, const Contact<2>& c1, const Contact<2>& c2, const Contact<2>& c3) {
-  using Ints = int __attribute__((vector_size(32)));
-  const Ints v{c0.i, c0.j, c1.i, c1.j, c2.i, c2.j, c3.i, c3.j};
-  const Ints equal = (v == __builtin_shufflevector(v, v, 2, 3, 4, 5, 6, 7, 0, 1)) |
-                     (v == __builtin_shufflevector(v, v, 3, 2, 5, 4, 7, 6, 1, 0)) |
-                     (v == __builtin_shufflevector(v, v, 4, 5, 6, 7, 0, 1, 2, 3)) |
-                     (v == __builtin_shufflevector(v, v, 5, 4, 7, 6, 1, 0, 3, 2));
-#ifdef __AVX__
-  return _mm256_testz_si256(reinterpret_cast<const __m256i&>(equal), reinterpret_cast<const __m256i&>(equal));
+inline Quad load(Body<2>* bodies, const int* at) {  // v_x, v_y, s, 1/m
+  return transpose({row(bodies[at[0]]), row(bodies[at[1]]), row(bodies[at[2]]), row(bodies[at[3]])});
+}
+
+inline void store(Body<2>* bodies, const int* at, const Quad& q) {
+  const Quad by_body = transpose(q);
+  row(bodies[at[0]]) = by_body.a;
+  row(bodies[at[1]]) = by_body.b;
+  row(bodies[at[2]]) = by_body.c;
+  row(bodies[at[3]]) = by_body.d;
+}
+
+// Whether a flag is set for any of the grains.
+inline bool any_of(const int* flags, const Contact<3>& c) { return flags[c.i] | flags[c.j]; }
+inline bool any_of(const int* flags, const Pack& pack) {
+#ifdef __AVX2__
+  const __m256i found = _mm256_i32gather_epi32(flags, *reinterpret_cast<const __m256i*>(pack.i), 4);
+  return !_mm256_testz_si256(found, found);
 #else
-  int any = 0;
-  for (int lane = 0; lane < 8; ++lane) any |= equal[lane];
-  return any == 0;
+  int found = 0;
+  for (int lane = 0; lane < 4; ++lane) found |= flags[pack.i[lane]] | flags[pack.j[lane]];
+  return found != 0;
 #endif
 }
 
-struct FourChanges {
-  Lanes change{}, size{}, speed2{};  // see Change in solvers.cpp
+template <Law law>
+struct WideSlip {
+  Lanes n, t{};
+  [[gnu::always_inline]] WideSlip(const Quad& a, const Quad& b, const Pack& c, const Lanes* bias_t) {
+    const Lanes u_x = b.a - a.a, u_y = b.b - a.b;
+    n = u_x * c.n_x + u_y * c.n_y + c.bias;
+    if constexpr (law != Law::frictionless) t = c.n_x * u_y - c.n_y * u_x - (a.c + b.c);
+    if constexpr (law == Law::coulomb_restitution) t += *bias_t;
+  }
+  bool open(const Pack& c) const { return !any((c.p.n > 0.0) | (n < 0.0)); }  // and stays open
 };
 
-template <class T>
-const Lanes& lanes(const T* p) {
-  return *reinterpret_cast<const Lanes*>(p);
-}
-
-inline Quad load(Body<2>* const* body) {  // v_x, v_y, s, 1/m
-  return transpose({lanes(body[0]), lanes(body[1]), lanes(body[2]), lanes(body[3])});
-}
-
-inline void store(Body<2>* const* body, const Quad& q) {
-  const Quad by_body = transpose(q);
-  *reinterpret_cast<Lanes*>(body[0]) = by_body.a;
-  *reinterpret_cast<Lanes*>(body[1]) = by_body.b;
-  *reinterpret_cast<Lanes*>(body[2]) = by_body.c;
-  *reinterpret_cast<Lanes*>(body[3]) = by_body.d;
-}
-
-template <bool friction>
-[[gnu::always_inline]] inline FourChanges update_four(const Four& four, double spin_ratio, double omega) {
-  auto half = [&](int k) {  // of each contact: n_x, n_y, bias, 1/W, then friction, p_n, p_t, bodies
-    auto part = [&](int lane) { return lanes(reinterpret_cast<const double*>(four.contact[lane]) + 4 * k); };
-    return transpose({part(0), part(1), part(2), part(3)});
-  };
-  const auto [n_x, n_y, bias, inv_w] = half(0);
-  const auto [mu, p_n, p_t, unused] = half(1);
-  Quad a = load(four.a), b = load(four.b);  // .a = v_x, .b = v_y, .c = s, .d = 1/m
-  const Lanes u_x = b.a - a.a, u_y = b.b - a.b;
-  const Lanes u_n = u_x * n_x + u_y * n_y + bias;
-  if (bits((p_n > 0.0) | (u_n < 0.0)) == 0) return {};  // all open, and stay open
+template <Law law>
+[[gnu::always_inline]] inline Change<Lanes> update(Pack& c, Body<2>* bodies, const Lanes* bias_t, double spin_ratio, double omega) {
+  Quad a = load(bodies, c.i), b = load(bodies, c.j);  // .a = v_x, .b = v_y, .c = s, .d = 1/m
+  const WideSlip<law> u(a, b, c, bias_t);
+  if (u.open(c)) return {};
   Impulse<2, Lanes> next;
-  if constexpr (friction) {
-    const Lanes u_t = n_x * u_y - n_y * u_x - (a.c + b.c);
-    const Lanes step = omega * inv_w;
-    next = obey_coulomb<2, Lanes>({p_n, p_t}, u_n, u_t, step, step / (1.0 + spin_ratio), mu);
-  } else {
-    next.n = positive(p_n - omega * inv_w * u_n);
-  }
-  const Lanes d_n = next.n - p_n, d_t = next.t - p_t;
-  const Lanes p_x = d_n * n_x - d_t * n_y, p_y = d_n * n_y + d_t * n_x;
+  const Lanes step = omega * c.inv_w;
+  if constexpr (law == Law::frictionless)
+    next.n = positive<Lanes>(c.p.n - step * u.n);
+  else
+    next = obey_coulomb<2, Lanes>(c.p, u.n, u.t, step, step * (1.0 / (1.0 + spin_ratio)), c.friction);
+  const Lanes d_n = next.n - c.p.n, d_t = next.t - c.p.t;
+  const Lanes p_x = d_n * c.n_x - d_t * c.n_y, p_y = d_n * c.n_y + d_t * c.n_x;
   a.a -= a.d * p_x, a.b -= a.d * p_y;
   b.a += b.d * p_x, b.b += b.d * p_y;
-  if constexpr (friction) a.c -= a.d * (spin_ratio * d_t), b.c -= b.d * (spin_ratio * d_t);
-  store(four.a, a);
-  store(four.b, b);
-  for (int lane = 0; lane < 4; ++lane) four.contact[lane]->p = {next.n[lane], next.t[lane]};
-  const Lanes w = 1.0 / inv_w, change = w * (d_n * d_n + d_t * d_t);
+  if constexpr (law != Law::frictionless) a.c -= a.d * (spin_ratio * d_t), b.c -= b.d * (spin_ratio * d_t);
+  store(bodies, c.i, a);
+  store(bodies, c.j, b);
+  c.p = next;
+  const Lanes w = a.d + b.d, change = w * (d_n * d_n + d_t * d_t);
   return {change, w * (next.n * next.n + next.t * next.t), w * change};
+}
+
+template <Law law>
+inline Change<Lanes> error(const Pack& c, Body<2>* bodies, const Lanes* bias_t) {
+  const Quad a = load(bodies, c.i), b = load(bodies, c.j);
+  const WideSlip<law> u(a, b, c, bias_t);
+  if (u.open(c)) return {};
+  const Lanes w = a.d + b.d, change = w * natural_map<2, Lanes>(c.p, u.n, u.t, c.inv_w, c.friction);
+  return {change, w * (c.p.n * c.p.n + c.p.t * c.p.t), w * change};
 }
 
 }  // namespace quicksand

@@ -93,13 +93,13 @@ TYPED_TEST(Solvers, a_step_that_misses_its_tolerance_throws_unless_accepted_and_
 }
 
 // The residual is local: a column needs some steps until what it hides, errors that vary smoothly over the height, has gone too.
-TYPED_TEST(Solvers, a_column_at_rest_starts_from_its_solution_and_needs_at_most_one_round_of_sweeps) {
+TYPED_TEST(Solvers, a_column_at_rest_starts_from_its_solution_and_needs_few_rounds_of_sweeps) {
   constexpr int dim = TypeParam::value;
   auto sim = column<dim>(30);
-  EXPECT_GT(sim.step(1e-3).sweeps, 30);
+  const int cold = sim.step(1e-3).sweeps;
   for (int k = 0; k < 50; ++k) sim.step(1e-3);
-  EXPECT_LE(sim.step(1e-3).sweeps, 8);  // one round: a sweep over all, six over the unsettled, a sweep over all
-  EXPECT_LE(sim.step(0.3e-3).sweeps, 8);  // impulses are scaled with the step
+  EXPECT_LE(30 * sim.step(1e-3).sweeps, cold);
+  EXPECT_LE(30 * sim.step(0.3e-3).sweeps, cold);  // impulses are scaled with the step
 }
 
 // A sub-step adds at most the error allowed to one contact, a share of the tolerance in diameters; repair keeps that from adding up.
