@@ -22,10 +22,10 @@ constexpr double skin = 1.3;
 
 // A sub-step has converged when its residual is below the tolerance and no single contact's error, as an overlap h W_nn |e|, is above
 // this share of the tolerance in mean diameters: the overlaps of a flow stay at about twice this bound, and a global norm hides them.
-constexpr double overlap_share = 0.05;
+constexpr double overlap_share = 0.03;
 
 // Overlaps above this share of the tolerance, in mean diameters, are taken back: the errors of a contact that lasts add up.
-constexpr double repair_above = 0.1;
+constexpr double repair_above = 0.06;
 constexpr double repaired = 0.5;  // of the excess, in a sub-step
 
 }  // namespace
