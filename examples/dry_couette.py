@@ -23,6 +23,10 @@ Flags
     --threads N         (all cores); results do not depend on it
     --seed N            of the radii, and of the small random velocities without which a lattice has no randomness:
                         uniform within 1 % of the wall speed, per component (0)
+    --frame-every S     interval of frames for ParaView and numpy, see docs/output.md; 0: none [s] (0.1)
+    --checkpoint-every S   interval of --out/checkpoint.h5 on the clock, one more at the end; 0: none [s] (60)
+    --restart FILE      go on from a checkpoint, in its folder and with its flags: only --out, --t-end, --threads, --no-plots,
+                        --frame-every, --checkpoint-every may be given anew. The results are those of a run without a break
     --quick             a run of some seconds: --height 0.03 --width 0.06 --t-end 2, where not given
     --no-plots          results.json only
 
@@ -93,7 +97,7 @@ class Scene:
     """The cell, its grains and its two walls."""
 
     def __init__(self, flags):
-        rng = np.random.default_rng(flags.seed)
+        self.rng = rng = np.random.default_rng(flags.seed)
         count = len(grains.hexagonal_lattice(flags.width, flags.height, 2.1 * RADIUS, RADIUS))
         radius = grains.uniform_radii(count, RADIUS, flags.size_ratio, rng)
         self.width, self.solid = flags.width, np.pi * (radius**2).sum()
@@ -159,6 +163,7 @@ def simulate(scene, flags):
     """Step to the end; every time step leaves a sample in the run, every tenth a profile."""
     run = study.Run(scene.sim, flags.dt, flags.t_end)
     profiles = grains.Profiles(axis=1, bins=max(20, round(flags.height / (2 * RADIUS))), cross_section=flags.width)
+    run.keep(flags, profiles=profiles, rng=scene.rng)
     lower, upper = scene.walls
     for report in run:
         low, high = scene.faces
@@ -242,7 +247,8 @@ def main():
     parser, flags = parse_flags()
     with parser.user_errors():
         scene = Scene(flags)
-    run, profiles = simulate(scene, flags)
+    with parser.user_errors(OSError):  # of its files
+        run, profiles = simulate(scene, flags)
     results, profile = measure(scene, run, profiles, flags)
     study.write_results(flags.out / "results.json", results)
     reference = all(getattr(flags, name) == parser.get_default(name) for name in REFERENCE_FLAGS)

@@ -46,6 +46,9 @@ struct Wall {
 
 // Friction and restitution for every pair of materials. Restitution: u_n+ = -normal u_n-, u_t+ = -tangential u_t-.
 class Materials {
+  template <int>
+  friend class Simulation;  // state.cpp
+
  public:
   struct Pair {
     double friction = -1.0;  // [-]; negative: never set

@@ -56,6 +56,9 @@ class Neighbours {
   // a bound, never an estimate.
   bool valid(const Grains<dim>& grains, const std::vector<Wall<dim>>& walls, double reach, double h, int threads);
 
+  template <class Archive>
+  void visit_state(Archive&& archive);  // state.cpp
+
   void forget() { skin_ = -1.0; }  // grains or walls were added or moved from outside
 
  private:

@@ -189,6 +189,18 @@ void bind(py::module_& m, const char* suffix) {
            },
            "Load-bearing contacts of the last sub-step: grain_i, grain_j (ids; wall w is -1 - w), normal (n, dim) from i to j,\n"
            "point (n, dim) [m], force_normal (n,) and force_tangential (n, dim) on j [N] (2D: N/m).")
+      .def("state",
+           [](const Sim& s) {
+             const std::vector<char> bytes = s.state();
+             return py::array_t<std::uint8_t>(bytes.size(), reinterpret_cast<const std::uint8_t*>(bytes.data()));
+           },
+           "All that the next step depends on, the number of threads left out: (n,) uint8, for restore() by the same version.")
+      .def("restore",
+           [](Sim& s, const py::array_t<std::uint8_t, py::array::c_style>& state) {
+             s.restore({reinterpret_cast<const char*>(state.data()), static_cast<std::size_t>(state.size())});
+           },
+           "state"_a, "Become the scene that state() was taken of; it goes on bit for bit. Its walls are numbered as they were.\n\n"
+           "Raises\n------\nValueError : of another version or dimension, or damaged; nothing is changed then")
       .def_property_readonly("time", &Sim::time, "[s]")
       .def_property_readonly("count", &Sim::count, "number of grains, those fixed to walls not counted")
       .def_property_readonly("dim", [](const Sim&) { return dim; })
@@ -279,6 +291,7 @@ py::object make(const std::optional<std::vector<std::optional<double>>>& period,
 
 PYBIND11_MODULE(_grains, m) {
   m.doc() = "Discs and spheres by Non-Smooth Contact Dynamics.";
+  m.attr("__version__") = QUICKSAND_VERSION;
   py::register_exception<NotConverged>(m, "NotConverged", PyExc_RuntimeError);
   bind<2>(m, "2D");
   bind<3>(m, "3D");

@@ -89,6 +89,10 @@ class Simulation {
 
   StepReport<dim> step(double dt);
 
+  // All that the next step depends on, the number of threads left out, as bytes for restore() of a scene of the same version and dimension.
+  std::vector<char> state() const;
+  void restore(std::span<const char> state);  // throws std::invalid_argument, and then changes nothing
+
   int count() const { return n_free_; }
   double time() const { return time_; }
   const Box<dim>& box() const { return box_; }
@@ -124,6 +128,8 @@ class Simulation {
     Mat<dim> virial = Mat<dim>::Zero();
   };
 
+  template <class Archive>
+  void visit_state(Archive&& archive);
   void prepare();
   int choose_threads();
   Motion measure_pairs();

@@ -8,11 +8,17 @@ import sys
 import tempfile
 from pathlib import Path
 
+from .checkpoint import read_checkpoint
+
+
+FREE = {"out", "threads", "t_end", "no_plots", "frame_every", "checkpoint_every", "restart"}  # may change when a run goes on
+
 
 class Parser(argparse.ArgumentParser):
     """Command line of a study, with the flags that every study has.
 
-    --out, --threads, --seed, --quick, --no-plots, --dt, --t-end, --tolerance. `--help` prints the study's docstring.
+    --out, --threads, --seed, --quick, --no-plots, --dt, --t-end, --tolerance, and of its files --frame-every, --checkpoint-every,
+    --restart. `--help` prints the study's docstring.
 
     Parameters
     ----------
@@ -38,6 +44,9 @@ class Parser(argparse.ArgumentParser):
         self.flag("--dt", type=number("s", above=0), default=dt)
         self.flag("--t-end", type=number("s", above=0), default=t_end, quick=quick_t_end)
         self.flag("--tolerance", type=number("", above=0))
+        self.flag("--frame-every", type=number("s", at_least=0), default=0.1)
+        self.flag("--checkpoint-every", type=number("s", at_least=0), default=60.0)
+        self.flag("--restart", type=Path)
 
     def flag(self, name, *, quick=None, **options):
         """`add_argument`, and the value that --quick uses where the user gives none."""
@@ -48,7 +57,9 @@ class Parser(argparse.ArgumentParser):
     def parse_args(self, args=None, namespace=None):
         """Parse and check the flags, and make the output directory."""
         flags = super().parse_args(args, namespace)
-        if flags.quick:
+        if flags.restart:
+            flags = self._as_before(flags.restart, args)
+        elif flags.quick:
             self.set_defaults(**self.quick)
             flags = super().parse_args(args, namespace)
         if flags.t_end < flags.dt:
@@ -59,12 +70,26 @@ class Parser(argparse.ArgumentParser):
                 pass  # better now than after the run
         return flags
 
+    def _as_before(self, path, args):
+        """The flags of the run that left the checkpoint; given anew only where that does not change what has been computed."""
+        with self.user_errors():
+            before, _ = read_checkpoint(path)
+        defaults, absent = vars(super().parse_args([])), object()
+        self.set_defaults(**dict.fromkeys(defaults, absent))
+        given = {name: value for name, value in vars(super().parse_args(args)).items() if value is not absent}
+        self.set_defaults(**defaults)
+        for name, value in given.items():
+            if name in defaults.keys() - FREE and value != before.get(name, value):
+                self.error(f"argument --{name.replace('_', '-')}: is {before[name]} in {path}, cannot be {value} after a restart")
+        kept = {name: value for name, value in before.items() if name in defaults and name not in ("restart", "out")}
+        return argparse.Namespace(**(defaults | kept | {"out": path.parent} | given))
+
     @contextlib.contextmanager
-    def user_errors(self):
-        """Around what a wrong flag can break (the scene, not the run): such errors end the program."""
+    def user_errors(self, *kinds):
+        """Around what a wrong flag or a full disk can break: such errors end the program (all of `kinds`; by default those of a scene)."""
         try:
             yield
-        except (ValueError, OSError, MemoryError) as error:
+        except kinds or (ValueError, OSError, MemoryError) as error:
             self.error(str(error))
 
     def format_help(self):

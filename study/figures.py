@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from quicksand.grains import contact_lines
+
 INK, FAINT, BLUE, RED, GREEN = "#222222", "#9aa5b1", "#1f5fa8", "#c2452d", "#2e7d4f"
 STYLE = {
     "font.size": 10, "axes.edgecolor": INK, "axes.labelcolor": INK, "axes.spines.top": False, "axes.spines.right": False,
@@ -132,7 +134,7 @@ def plot_snapshot(path, sim, low, high, fixed=None, title=""):
     for y in (low, high):
         axis.axhline(y, color=INK, linewidth=1.5)
 
-    lines, force = _branches(sim, position, period)
+    lines, force = _force_chains(sim, period)
     if force.size:
         thickest = np.percentile(force, 99)
         widths = 2.5 * np.minimum(force / thickest, 2.0) if thickest > 0 else 0.0
@@ -163,24 +165,10 @@ def _discs(axis, position, radius, period, value, **options):
     return axis.add_collection(discs)
 
 
-def _branches(sim, position, period):
-    """Segments (n, 2, 2) [m] from centre to centre, and their normal forces (n,) [N/m].
-
-    At a wall or a grain fixed to one they end in the contact. A segment that leaves the period is drawn from both ends.
-    """
-    contacts = sim.contacts()
-    loaded = contacts["force_normal"] > 0
-    i, j = contacts["grain_i"][loaded], contacts["grain_j"][loaded]
-    point, force = contacts["point"][loaded], contacts["force_normal"][loaded]
-
-    def centre(grain):
-        return np.where((grain >= 0)[:, None], position[np.maximum(grain, 0)], point)
-
-    start, branch = centre(i), centre(j) - centre(i)
-    branch[:, 0] -= period * np.round(branch[:, 0] / period)
-    start[:, 0] -= period * np.round(start[:, 0] / period)
-    end = start + branch
+def _force_chains(sim, period):
+    """Segments (n, 2, 2) [m] of contacts, and their normal forces (n,) [N/m]; one that leaves the period is drawn from both ends."""
+    segments, contacts = contact_lines(sim)
+    force, end = contacts["force_normal"], segments[:, 1]
     leaves = np.abs(end[:, 0]) > period / 2
     shift = np.column_stack([np.copysign(period, end[leaves, 0]), np.zeros(leaves.sum())])
-    segments = np.stack([start, end], axis=1)
     return np.concatenate([segments, segments[leaves] - shift[:, None, :]]), np.concatenate([force, force[leaves]])

@@ -2,10 +2,10 @@
 
 import json
 import math
-import os
-import tempfile
 
 import numpy as np
+
+from quicksand.grains.frames import write_whole
 
 
 def write_results(path, results):
@@ -18,16 +18,7 @@ def write_results(path, results):
         Numbers in SI, strings, None, or lists of these.
     """
     text = json.dumps({key: _plain(value) for key, value in results.items()}, indent=2, allow_nan=False) + "\n"
-    with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=path.name, suffix=".part", delete=False) as file:
-        try:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-            os.fchmod(file.fileno(), 0o644)  # NamedTemporaryFile makes it 0600
-            os.replace(file.name, path)
-        except BaseException:
-            os.unlink(file.name)
-            raise
+    write_whole(path, text.encode(), sync=True)
 
 
 def _plain(value):

@@ -1,11 +1,17 @@
-"""The stepping loop of a study: one sample per time step, progress, an end by Ctrl-C that loses nothing."""
+"""The stepping loop of a study: one sample per time step, progress, frames and checkpoints, an end by Ctrl-C that loses nothing."""
 
+import json
 import signal
 import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
+
+from quicksand.grains import Frames
+
+from .checkpoint import read_checkpoint, write_checkpoint
 
 REPORTED = ("time", "sub_steps", "sweeps", "residual", "max_overlap", "unconverged", "work_walls", "energy_balance_error")
 
@@ -37,12 +43,15 @@ class Run:
         self.wall_time = 0.0  # spent in stepping [s]
         self.interrupted = False
         self._series = {}  # name: array that doubles when full; NaN where nothing was recorded
+        self._files = None
 
     def __iter__(self):
         in_main_thread = threading.current_thread() is threading.main_thread()  # only there can signals be caught
         before = signal.signal(signal.SIGINT, self._interrupt) if in_main_thread else None
         progress = self._progress_bar()
         try:
+            if self._files:
+                self._files.before_first_step(self)
             while self.samples < self.steps and not self.interrupted:
                 start = time.perf_counter()
                 report = self.sim.step(self.dt)
@@ -50,13 +59,30 @@ class Run:
                 self.samples += 1
                 self.record(**{name: getattr(report, name) for name in REPORTED})
                 yield report
+                if self._files:
+                    self._files.after_step(self)
                 if progress is not None:
                     progress.update()
+            if self._files:
+                self._files.at_end(self)
         finally:
             if progress is not None:
                 progress.close()
             if in_main_thread:
                 signal.signal(signal.SIGINT, before)
+
+    def keep(self, flags, **parts):
+        """Write frames and checkpoints from now on, or go on from the checkpoint of --restart.
+
+        Parameters
+        ----------
+        flags : argparse.Namespace
+            Of `study.Parser`: out, restart, frame_every, checkpoint_every, and all others as the parameters of the run.
+        **parts
+            What changes during the run beside the simulation: random generators of numpy, and objects with `state()`, a dict of
+            arrays, and `restore(state)`.
+        """
+        self._files = _Files(self, flags, parts)
 
     def record(self, **values):
         """Put scalars into the sample of the step just made."""
@@ -71,6 +97,11 @@ class Run:
     def __getitem__(self, name):
         """Series of a recorded quantity, (samples,) array."""
         return self._series[name][:self.samples] if self.samples else np.empty(0)
+
+    @property
+    def names(self):
+        """Of the recorded quantities."""
+        return list(self._series)
 
     def since(self, start):
         """The samples with time >= start [s], as a `Window`; none where start is None."""
@@ -100,7 +131,60 @@ class Run:
             return None
         from tqdm import tqdm
 
-        return tqdm(total=self.steps, unit="step", smoothing=0.05, leave=False, dynamic_ncols=True)
+        return tqdm(total=self.steps, initial=self.samples, unit="step", smoothing=0.05, leave=False, dynamic_ncols=True)
+
+
+class _Files:
+    """Frames every so often in the time of the scene, checkpoints every so often on the clock."""
+
+    def __init__(self, run, flags, parts):
+        self.parts, self.path = parts, flags.out / "checkpoint.h5"
+        self.parameters = json.dumps({name: str(value) if isinstance(value, Path) else value for name, value in vars(flags).items()})
+        self.frame_steps = max(round(flags.frame_every / run.dt), 1) if flags.frame_every > 0 else 0
+        self.checkpoint_every = flags.checkpoint_every
+        self.written = 0  # samples that are in frames
+        count = self._restore(run, flags.restart) if flags.restart else 0
+        self.frames = Frames(flags.out, self.parameters, count) if self.frame_steps else None
+        self.last = time.monotonic()
+
+    def before_first_step(self, run):
+        if self.frames and run.samples == 0:
+            self.frames.write(run.sim)
+
+    def after_step(self, run):
+        if self.frames and run.samples % self.frame_steps == 0:
+            self.frames.write(run.sim, {name: run[name][self.written:] for name in run.names})
+            self.written = run.samples
+        if 0 < self.checkpoint_every <= time.monotonic() - self.last:
+            self._checkpoint(run)
+
+    def at_end(self, run):
+        if self.checkpoint_every > 0:
+            self._checkpoint(run)
+
+    def _checkpoint(self, run):
+        parts = {"grains": {"state": run.sim.state()}, "series": {name: run[name] for name in run.names},
+                 "run": {"samples": run.samples, "wall_time": run.wall_time, "written": self.written,
+                         "frames": self.frames.count if self.frames else 0}}
+        for name, part in self.parts.items():
+            random = isinstance(part, np.random.Generator)
+            parts[name] = {"state": json.dumps(part.bit_generator.state)} if random else part.state()
+        write_checkpoint(self.path, self.parameters, parts)
+        self.last = time.monotonic()
+
+    def _restore(self, run, path):
+        _, parts = read_checkpoint(path)
+        run.sim.restore(parts["grains"]["state"])
+        for name, part in self.parts.items():
+            state = parts.get(name, {})
+            if isinstance(part, np.random.Generator):
+                part.bit_generator.state = json.loads(bytes(state["state"]))
+            else:
+                part.restore(state)
+        run.samples, run.wall_time = int(parts["run"]["samples"]), float(parts["run"]["wall_time"])
+        run._series = dict(parts.get("series", {}))
+        self.written = int(parts["run"]["written"])
+        return int(parts["run"]["frames"])
 
 
 class Window(dict):

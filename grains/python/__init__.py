@@ -4,7 +4,8 @@ Holds nothing of its own. Importing it loads numpy and the compiled module only;
 tqdm are imported where they are used.
 """
 
-from ._grains import NotConverged, Simulation, Simulation2D, Simulation3D, StepReport2D, StepReport3D, Wall2D, Wall3D
+from ._grains import __version__, NotConverged, Simulation, Simulation2D, Simulation3D, StepReport2D, StepReport3D, Wall2D, Wall3D
+from .frames import Frames, contact_lines
 from .packing import hexagonal_lattice, uniform_radii
 from .profiles import Profile, Profiles
 from .steady_state import BlockAverage, SteadyState, block_average, detect_steady_state, ratio_error

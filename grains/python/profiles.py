@@ -43,6 +43,20 @@ class Profiles:
         """Add the profile between `low` and `high` [m] as it is now."""
         self.samples.append((sim.time, high - low, sim.profile(self.axis, low, high, self.bins)))
 
+    def state(self):
+        """The samples as arrays, for `restore`."""
+        if not self.samples:
+            return {}
+        time, height, profiles = zip(*self.samples)
+        return {"time": np.array(time), "height": np.array(height)} | {
+            name: np.array([profile[name] for profile in profiles]) for name in profiles[0]}
+
+    def restore(self, state):
+        """Take the samples from what `state` returned."""
+        fields = [name for name in state if name not in ("time", "height")]
+        self.samples = [(float(time), float(height), {name: state[name][k] for name in fields})
+                        for k, (time, height) in enumerate(zip(state.get("time", []), state.get("height", [])))]
+
     def mean(self, start):
         """Average over the samples with time >= start [s], a `Profile`; None without samples, or where start is None."""
         chosen = [(height, profile) for time, height, profile in self.samples if start is not None and time >= start]
