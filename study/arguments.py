@@ -14,7 +14,30 @@ from .checkpoint import read_checkpoint
 FREE = {"out", "threads", "t_end", "no_plots", "frame_every", "checkpoint_every", "restart"}  # may change when a run goes on
 
 
-class Parser(argparse.ArgumentParser):
+class CommandLine(argparse.ArgumentParser):
+    """A command line whose errors are one line on stderr and exit status 2, and whose --help is the script's docstring."""
+
+    def __init__(self, doc):
+        super().__init__(allow_abbrev=False)
+        self.doc = doc
+
+    @contextlib.contextmanager
+    def user_errors(self, *kinds):
+        """Around what a wrong flag or a full disk can break: such errors end the program (all of `kinds`; by default those of a scene)."""
+        try:
+            yield
+        except kinds or (ValueError, OSError, MemoryError) as error:
+            self.error(str(error))
+
+    def format_help(self):
+        return self.doc.strip() + "\n"
+
+    def error(self, message):
+        sys.stdout.flush()
+        self.exit(2, f"{self.prog}: {' '.join(message.split())}{os.linesep}")
+
+
+class Parser(CommandLine):
     """Command line of a study, with the flags that every study has.
 
     --out, --threads, --seed, --quick, --no-plots, --dt, --t-end, --tolerance, and of its files --frame-every, --checkpoint-every,
@@ -33,8 +56,7 @@ class Parser(argparse.ArgumentParser):
     """
 
     def __init__(self, doc, out, dt, t_end, quick_t_end):
-        super().__init__(allow_abbrev=False)
-        self.doc = doc
+        super().__init__(doc)
         self.quick = {}  # values that --quick puts in place of defaults
         self.flag("--out", type=Path, default=Path(out))
         self.flag("--threads", type=whole(at_least=1))
@@ -83,21 +105,6 @@ class Parser(argparse.ArgumentParser):
                 self.error(f"argument --{name.replace('_', '-')}: is {before[name]} in {path}, cannot be {value} after a restart")
         kept = {name: value for name, value in before.items() if name in defaults and name not in ("restart", "out")}
         return argparse.Namespace(**(defaults | kept | {"out": path.parent} | given))
-
-    @contextlib.contextmanager
-    def user_errors(self, *kinds):
-        """Around what a wrong flag or a full disk can break: such errors end the program (all of `kinds`; by default those of a scene)."""
-        try:
-            yield
-        except kinds or (ValueError, OSError, MemoryError) as error:
-            self.error(str(error))
-
-    def format_help(self):
-        return self.doc.strip() + "\n"
-
-    def error(self, message):
-        sys.stdout.flush()
-        self.exit(2, f"{self.prog}: {' '.join(message.split())}{os.linesep}")
 
 
 def number(unit, above=None, at_least=None):

@@ -108,6 +108,36 @@ def plot_profile(path, profile, wall_rate):
 
 
 @_styled
+def plot_flow_curves(path, curves, label):
+    """mu(I) and phi(I) on a logarithmic axis: filled markers flow, open ones do not; lines are fits, dashed ones published.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+    curves : list of dict
+        label, colour; i, mu, mu_err, phi, phi_err, flowing: (n,) arrays; fit, thesis: functions mu(I), or None.
+    label : str
+        Of the axis of I.
+    """
+    figure, axes = _figure(1, 2, (11, 4.4))
+    for curve in curves:
+        colour, flowing = curve["colour"], curve["flowing"]
+        for axis, name in zip(axes, ("mu", "phi")):
+            for chosen, face in ((flowing, colour), (~flowing, "white")):
+                axis.errorbar(curve["i"][chosen], curve[name][chosen], np.nan_to_num(curve[f"{name}_err"][chosen]), fmt="o", color=colour,
+                              markerfacecolor=face, markersize=5, elinewidth=0.8, label=curve["label"] if face == colour else None)
+        i = np.geomspace(curve["i"][flowing].min(), curve["i"][flowing].max()) if flowing.any() else np.empty(0)
+        for function, style in ((curve["fit"], "-"), (curve["thesis"], "--")):
+            if function and i.size:
+                axes[0].plot(i, function(i), style, color=colour, linewidth=1)
+    for axis, name in zip(axes, (r"$\mu$ [-]", r"$\phi$ [-]")):
+        axis.set(xscale="log", xlabel=label, ylabel=name)
+    axes[0].legend()
+    axes[0].set_title("filled: flowing, open: not; lines: fits, dashed: the thesis's", fontsize=9, loc="left")
+    figure.savefig(path)
+
+
+@_styled
 def plot_snapshot(path, sim, low, high, fixed=None, title=""):
     """Discs coloured by v_x, with the normal contact forces as lines between centres (force chains).
 

@@ -40,7 +40,7 @@ def write_whole(path, data, sync=False):
             os.unlink(part)
             raise
     except OSError as error:
-        raise type(error)(error.errno, f"cannot write: {error.strerror}", str(path)) from error
+        raise OSError(f"cannot write {path}: {error.strerror or error}; files written before it are whole") from error
 
 
 def hdf5_bytes(fill):
