@@ -70,13 +70,16 @@ class Frames:
     """
 
     def __init__(self, folder, parameters="{}", count=0):
+        import h5py
+
         self.folder, self.parameters, self.count = Path(folder), parameters, count
-        self.times = {}  # of the frames in the folder, by number [s]
+        self.numbers = []  # of the frames in the folder
         self.grids = {"grains": [], "contacts": []}  # XDMF of each frame
         (self.folder / "frames").mkdir(parents=True, exist_ok=True)
         for path in sorted((self.folder / "frames").glob("*.h5")):
             if path.stem.isdigit() and int(path.stem) < count:
-                self._take(path)
+                with h5py.File(path) as frame:
+                    self._take(path, frame.attrs["time"], frame)
             else:
                 path.unlink()
         self._write_index()
@@ -90,20 +93,26 @@ class Frames:
         series : dict of (n,) arrays, optional
             Time series since the last frame.
         """
+        groups = {"grains": _grains(sim), "contacts": _contacts(sim)}
+
+        def fill(file):
+            file.attrs["time"] = sim.time
+            for group, arrays in groups.items():
+                for name, values in arrays.items():
+                    file[f"{group}/{name}"] = values
+            if series:
+                file["series"] = np.rec.fromarrays(list(series.values()), names=list(series))  # one dataset: it is read field by field
+
         path = self.folder / "frames" / f"{self.count:06d}.h5"
-        write_whole(path, hdf5_bytes(lambda file: _fill(file, sim, series or {})))
+        write_whole(path, hdf5_bytes(fill))
         self.count += 1
-        self._take(path)
+        self._take(path, sim.time, groups)
         self._write_index()
 
-    def _take(self, path):
-        import h5py
-
-        with h5py.File(path) as frame:
-            self.times[int(path.stem)] = frame.attrs["time"]
-            for name, topology in (("grains", "Polyvertex"), ("contacts", "Polyline")):
-                grid = _grid(frame[name], f"{path.parent.name}/{path.name}:/{name}", topology, frame.attrs["time"])
-                self.grids[name].append(grid)
+    def _take(self, path, time, frame):
+        self.numbers.append(path.stem)
+        for name, grids in self.grids.items():
+            grids.append(_grid(frame[name], f"frames/{path.name}:/{name}", time))
 
     def _write_index(self):
         import h5py
@@ -113,8 +122,8 @@ class Frames:
         def fill(file):
             file.attrs["version"], file.attrs["parameters"] = __version__, self.parameters
             frames = file.create_group("frames")
-            for number in self.times:
-                frames[f"{number:06d}"] = h5py.ExternalLink(f"frames/{number:06d}.h5", "/")
+            for number in self.numbers:
+                frames[number] = h5py.ExternalLink(f"frames/{number}.h5", "/")
 
         write_whole(self.folder / "run.h5", hdf5_bytes(fill))
         for name, grids in self.grids.items():
@@ -123,27 +132,23 @@ class Frames:
             write_whole(self.folder / f"{name}.xdmf", text.encode())
 
 
-def _fill(file, sim, series):
-    file.attrs["time"] = sim.time
-    position = _three(sim.position)
-    grains = file.create_group("grains")
-    grains["position"], grains["radius"] = position, sim.radius
-    grains["velocity"], grains["spin"] = _three(sim.velocity), sim.spin
+def _grains(sim):
+    return {"position": _three(sim.position), "radius": sim.radius, "velocity": _three(sim.velocity), "spin": sim.spin}
 
+
+def _contacts(sim):
     lines, contacts = contact_lines(sim)
-    group = file.create_group("contacts")
-    group["position"] = _three(lines.reshape(-1, lines.shape[-1]))
-    group["connectivity"] = np.arange(2 * len(lines), dtype=np.int32).reshape(-1, 2)
-    group["force"] = _three(contacts["force_normal"][:, None] * contacts["normal"] + contacts["force_tangential"])
-    group["force_normal"], group["grain_i"], group["grain_j"] = contacts["force_normal"], contacts["grain_i"], contacts["grain_j"]
-
-    for name, values in series.items():
-        file[f"series/{name}"] = values
+    force = contacts["force_normal"][:, None] * contacts["normal"] + contacts["force_tangential"]
+    return {"position": _three(lines.reshape(-1, lines.shape[-1])),
+            "connectivity": np.arange(2 * len(lines), dtype=np.int32).reshape(-1, 2), "force": _three(force),
+            "force_normal": contacts["force_normal"], "grain_i": contacts["grain_i"], "grain_j": contacts["grain_j"]}
 
 
 def _three(vectors):
     """(n, 2) or (n, 3) as (n, 3), which is all that ParaView takes for vectors."""
-    return np.pad(vectors, ((0, 0), (0, 3 - vectors.shape[1])))
+    three = np.zeros((len(vectors), 3))
+    three[:, :vectors.shape[1]] = vectors
+    return three
 
 
 def contact_lines(sim):
@@ -172,25 +177,26 @@ def contact_lines(sim):
     return np.stack([start, start + branch], axis=1), contacts
 
 
-def _grid(group, place, topology, time):
-    """XDMF of one frame: points or lines, and every array that has one value or vector for each."""
-    points, count = len(group["position"]), len(group["radius"] if "radius" in group else group["connectivity"])
-    cells = _item(group, place, "connectivity") if "connectivity" in group else ""
-    kind = ' NodesPerElement="2"' if cells else ""
-    text = [f'<Grid Name="{place}" GridType="Uniform"><Time Value="{time:.12g}"/>\n',
-            f'<Topology TopologyType="{topology}"{kind} NumberOfElements="{count}">{cells}</Topology>\n',
-            f'<Geometry GeometryType="XYZ">{_item(group, place, "position")}</Geometry>\n']
-    for name in group:
-        if name in ("position", "connectivity") or not points:
-            continue
-        rank = "Vector" if group[name].ndim == 2 else "Scalar"
-        center = "Cell" if cells else "Node"
-        text.append(f'<Attribute Name="{name}" AttributeType="{rank}" Center="{center}">{_item(group, place, name)}</Attribute>\n')
-    return "".join(text) + "</Grid>\n" if points else ""  # readers stumble over empty grids
+def _grid(arrays, place, time):
+    """XDMF of one frame: points, or lines where there is a connectivity, and every array that has one value or vector for each."""
+    if not len(arrays["position"]):
+        return ""  # readers stumble over empty grids
+    if "connectivity" in arrays:
+        center, topology = "Cell", f'TopologyType="Polyline" NodesPerElement="2" NumberOfElements="{len(arrays["connectivity"])}"'
+        cells = _item(arrays, place, "connectivity")
+    else:
+        center, topology, cells = "Node", f'TopologyType="Polyvertex" NumberOfElements="{len(arrays["position"])}"', ""
+    text = [f'<Grid Name="{place}" GridType="Uniform"><Time Value="{time:.12g}"/>\n<Topology {topology}>{cells}</Topology>\n',
+            f'<Geometry GeometryType="XYZ">{_item(arrays, place, "position")}</Geometry>\n']
+    for name in arrays:
+        if name not in ("position", "connectivity"):
+            rank = "Vector" if arrays[name].ndim == 2 else "Scalar"
+            text.append(f'<Attribute Name="{name}" AttributeType="{rank}" Center="{center}">{_item(arrays, place, name)}</Attribute>\n')
+    return "".join(text) + "</Grid>\n"
 
 
-def _item(group, place, name):
-    data = group[name]
+def _item(arrays, place, name):
+    data = arrays[name]
     number = "Float" if data.dtype.kind == "f" else "Int"
     shape = " ".join(map(str, data.shape))
     return (f'<DataItem Dimensions="{shape}" NumberType="{number}" Precision="{data.dtype.itemsize}" Format="HDF">'

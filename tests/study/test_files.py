@@ -87,7 +87,7 @@ def test_frames_hold_the_scene_and_the_series(unbroken):
         last = shots[-1]
         assert {name: last["grains"][name].shape for name in last["grains"]} == {
             "position": (n, 3), "radius": (n,), "velocity": (n, 3), "spin": (n,)}
-        mu = np.concatenate([shot["series/mu"] for shot in shots if "series" in shot])
+        mu = np.concatenate([shot["series"]["mu"] for shot in shots if "series" in shot])
         assert mu.size == 1000
         force = last["contacts/force"][()]
         np.testing.assert_allclose(np.abs(force[:, 2]), 0)
