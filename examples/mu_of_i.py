@@ -204,7 +204,9 @@ def plot(out, runs, results):
                     "thesis": None if suffix or ratio not in THESIS_FITS else lambda i, f=THESIS_FITS[ratio]: mu_of_i(i, *f),
                 })
             label = "bulk" if suffix else "nominal"
-            study.plot_flow_curves(out / f"{name}{suffix}.png", [c for c in curves if c["i"].size], f"inertial number $I$, {label} shear rate [-]")
+            curves = [curve for curve in curves if curve["i"].size]
+            if curves:
+                study.plot_flow_curves(out / f"{name}{suffix}.png", curves, f"inertial number $I$, {label} shear rate [-]")
 
 
 def main():

@@ -321,6 +321,8 @@ class Sweeper {
   long updates_ = 0, unsettled_ = 0;
 };
 
+constexpr double strongest_omega = 1.8;
+
 // Fewer contacts than that are swept sooner by one thread than several can meet at the ends of the colours.
 constexpr long worth_sharing = 2000;
 
@@ -334,6 +336,7 @@ SolveReport relax(Problem<dim>& problem, const SolverSettings& settings, bool ac
   double omega = active_set ? settings.omega : 1.0;
   double trial = settings.tolerance, trial_worst = 2 * settings.worst;  // changes below which the residual is looked at
   double before = std::numeric_limits<double>::infinity(), before_worst = before;
+  int unchecked = 0;  // passes since the last look at the residual that may have been enough
   int slow = 0, limit = settings.max_sweeps;
   bool fallen_back = !active_set;
   const long contacts = std::accumulate(problem.count.begin(), problem.count.end(), 1L);
@@ -364,6 +367,7 @@ SolveReport relax(Problem<dim>& problem, const SolverSettings& settings, bool ac
           };
           trial = lower(trial, before, settings.tolerance, report.residual);
           trial_worst = lower(trial_worst, before_worst, settings.worst, report.worst);
+          unchecked = 0;
           next = fallen_back ? Next::sweep : Next::active;
           if (out_of_sweeps) fallen_back = true, omega = 1.0, limit += settings.max_sweeps, next = Next::sweep;
         }
@@ -371,11 +375,15 @@ SolveReport relax(Problem<dim>& problem, const SolverSettings& settings, bool ac
         const double change = sweeper.relative();
         // Over-relaxation can cycle in dense states: three sweeps in a row that gain less than a fifth halve omega - 1.
         slow = change > 0.8 * before ? slow + 1 : 0;
-        if (slow >= 3) omega = omega < 1.1 ? 1.0 : 1.0 + 0.5 * (omega - 1.0), slow = 0;
+        // Where that does not help it was no cycle, but impulses that balance each other, as of a wedged grain, and fade slowly.
+        if (!fallen_back && slow >= (omega > 1.0 ? 3 : 10))
+          omega = omega == 1.0 ? strongest_omega : (omega < 1.1 ? 1.0 : 1.0 + 0.5 * (omega - 1.0)), slow = 0;
         before = change, before_worst = sweeper.worst();
         // Settled: an equal share of the tolerance in the energy norm, and well below the error allowed to one contact.
         sweeper.settle(settings.tolerance * settings.tolerance * sweeper.size() / static_cast<double>(contacts), 0.3 * settings.worst);
-        next = (change <= trial && before_worst <= trial_worst) || sweeper.sweeps() >= limit ? Next::check : (fallen_back ? Next::sweep : Next::active);
+        const bool promising = change <= trial && before_worst <= trial_worst;
+        const bool worth_a_look = change <= settings.tolerance && before_worst <= 2 * settings.worst && ++unchecked >= 5;
+        next = promising || worth_a_look || sweeper.sweeps() >= limit ? Next::check : (fallen_back ? Next::sweep : Next::active);
       }
     }
   }

@@ -42,7 +42,7 @@ struct SolverSettings {
   double tolerance = 1e-2;   // on the residual [-]
   double worst = std::numeric_limits<double>::infinity();  // on W_nn |e| of every contact [m/s]
   double rounding = 0.0;     // W_nn |e| that velocities in double precision cannot tell from 0 [m/s]
-  int max_sweeps = 1000;     // over the contacts, then as many again by the fallback
+  int max_sweeps = 5000;     // over the contacts, then as many again by the fallback
   int active_sweeps = 6;     // over contacts that have not settled, before each over all that these have touched
   double omega = 1.5;        // over-relaxation to start from [-]
 };

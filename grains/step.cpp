@@ -77,9 +77,10 @@ StepReport<dim> Simulation<dim>::step(double dt) {
     report.unconverged += !solved.converged;
     if (!solved.converged && !settings.accept_unconverged)
       throw NotConverged(fmt::format(
-          "step: residual {:.2e} above the tolerance {:.2e} after {} sweeps at t = {:.6g} s; raise max_sweeps or the "
-          "tolerance, or accept such steps with accept_unconverged (they are counted)",
-          solved.residual, settings.solve.tolerance, solved.sweeps, time_));
+          "step: residual {:.2e} (tolerance {:.2e}) and error of one contact {:.2e} mean diameters (at most {:.2e}) after {} sweeps at "
+          "t = {:.6g} s; raise max_sweeps or the tolerance, or accept such steps with accept_unconverged (they are counted)",
+          solved.residual, settings.solve.tolerance, h * solved.worst / (2 * mean_radius_), overlap_share * settings.solve.tolerance,
+          solved.sweeps, time_));
   }
 
   report.time = time_;
