@@ -11,8 +11,10 @@ namespace quicksand {
 
 template <int dim>
 using Vec = Eigen::Matrix<double, dim, 1>;
-template <int dim>
-using Mat = Eigen::Matrix<double, dim, dim>;
+template <int dim>  // DontAlign: Eigen would align Mat<2> by what the processor has, a program without AVX then misread a library with it
+using Mat = Eigen::Matrix<double, dim, dim, Eigen::ColMajor | Eigen::DontAlign>;
+static_assert(alignof(Vec<2>) == 16 && alignof(Vec<3>) == 8 && alignof(Mat<2>) == 8,
+              "quicksand: layouts differ from the library's; Eigen's alignment must not be turned off");
 
 // A grain turns with angular velocity omega; the solver stores s = r omega [m/s], so that no radius enters a sweep.
 // Tangent: the part of a vector in the contact plane. 2D: its component on t = (-n_y, n_x). 3D: a vector normal to n.

@@ -207,7 +207,7 @@ class Sweeper {
     int total = 0;
     for (std::size_t b = 0; b < n_blocks; ++b) s_.first[b] = total, total += s_.units[b];
     s_.packs.resize(total);
-    if (law == Law::coulomb_restitution) s_.bias_t.assign(total, Lanes{});
+    if (law == Law::coulomb_restitution) s_.bias_t.assign(total, PackBias{});
 #pragma omp parallel num_threads(p_.threads)
     each_block([&](int b) { fill_packs(b); });
   }
@@ -236,7 +236,7 @@ class Sweeper {
       for (int lane = 0; lane < 4; ++lane) {
         put(pack, lane, slots[lane] < 0 ? empty : p_.contacts[slots[lane]]);
         if (law == Law::coulomb_restitution && slots[lane] >= 0 && !p_.bias_t.empty())
-          s_.bias_t[s_.first[b] + k][lane] = p_.bias_t[slots[lane]];
+          s_.bias_t[s_.first[b] + k].t[lane] = p_.bias_t[slots[lane]];
       }
     }
   }
@@ -292,7 +292,7 @@ class Sweeper {
     };
     Body<dim>* const bodies = p_.bodies.data();
     if constexpr (wide) {
-      auto bias_t = [&](int k) { return law == Law::coulomb_restitution ? &s_.bias_t[s_.first[b] + k] : nullptr; };
+      auto bias_t = [&](int k) { return law == Law::coulomb_restitution ? &s_.bias_t[s_.first[b] + k].t : nullptr; };
       if (what == Pass::residual)
         visit([&](Pack& c, int k) { return error<law>(c, bodies, bias_t(k)); });
       else

@@ -14,7 +14,7 @@ namespace quicksand {
 // What solvers keep in memory from one problem to the next.
 struct Scratch {
   std::vector<Pack> packs;                // 2D: the contacts, block by block
-  std::vector<Lanes> bias_t;              // of each pack
+  std::vector<PackBias> bias_t;           // of each pack
   std::vector<std::array<int, 4>> slots;  // of the contacts of each pack, from the first slot of a block on; -1: empty lane
   std::vector<int> first, units;          // per block: first pack; packs, or in 3D contacts
   std::vector<int> list, listed;          // per slot, per block: what has not settled

@@ -12,6 +12,8 @@
 
 namespace quicksand {
 
+// Their own alignment is 16 without AVX and 32 with it. What is kept in memory says 32, so that programs and libraries built for
+// other processors agree; lanes by themselves are passed differently too, and only within the solver.
 using Lanes = double __attribute__((vector_size(32), may_alias));
 
 // Whether a comparison holds in any lane.
@@ -27,7 +29,7 @@ inline bool any(int one) { return one != 0; }
 
 // Up to four contacts that share no grain: updating them at once is updating one after the other. They fill the lanes from the
 // last; an empty lane names the grains of the last and has 1/W = 0, so that what it stores changes nothing and is stored first.
-struct Pack {
+struct alignas(32) Pack {
   Lanes n_x, n_y;
   Lanes bias;
   Lanes inv_w;
@@ -36,6 +38,10 @@ struct Pack {
   int i[4], j[4];
 };
 static_assert(sizeof(Pack) == 256);
+
+struct alignas(32) PackBias {
+  Lanes t;  // tangential restitution, see Problem::bias_t
+};
 
 inline void put(Pack& pack, int lane, const Contact<2>& c) {
   pack.n_x[lane] = c.n.x(), pack.n_y[lane] = c.n.y();

@@ -1,0 +1,5 @@
+include(CMakeFindDependencyMacro)
+find_dependency(Eigen3)
+find_dependency(fmt)
+find_dependency(OpenMP)
+include(${CMAKE_CURRENT_LIST_DIR}/quicksandTargets.cmake)

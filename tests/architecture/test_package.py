@@ -1,0 +1,59 @@
+"""Quicksand installed: a C++ program that knows the prefix only, and one version number everywhere."""
+
+import pathlib
+import re
+import subprocess
+
+import pytest
+
+import quicksand
+
+ROOT = pathlib.Path(__file__).parents[2]
+BUILD = pathlib.Path(quicksand.__file__).parents[2]
+
+
+def run(*command):
+    done = subprocess.run([str(word) for word in command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def prefix(tmp_path_factory):
+    """Moved after the install: a package may not know where it was installed first."""
+    folder = tmp_path_factory.mktemp("package")
+    run("cmake", "--install", BUILD, "--prefix", folder / "first")
+    return (folder / "first").rename(folder / "moved")
+
+
+def test_the_package_names_no_folder_of_this_machine(prefix):
+    files = list(prefix.rglob("*.cmake"))
+    assert len(files) >= 4
+    for file in files:
+        assert not [place for place in (ROOT, BUILD, prefix.parent) if str(place) in file.read_text()], file
+
+
+def test_the_floor_of_the_cpp_example_carries_the_weight(prefix, tmp_path):
+    # The example is built without -march=native, unlike the library of the release preset: what both see has to lie in the
+    # same places all the same.
+    for file in (ROOT / "examples" / "cpp").iterdir():
+        (tmp_path / file.name).write_text(file.read_text())
+    run("cmake", "-G", "Ninja", "-S", tmp_path, "-B", tmp_path / "build", f"-DCMAKE_PREFIX_PATH={prefix}",
+        "-DCMAKE_CXX_FLAGS=-Wall -Wextra -Werror")
+    run("cmake", "--build", tmp_path / "build")
+    printed = run(tmp_path / "build" / "column")
+    numbers = re.fullmatch(r"run-out (\S+) widths, coordination (\S+), largest overlap (\S+) d\n"
+                           r"floor carries (\S+) of the weight, error of its impulse (\S+), (\d+) sub-steps unconverged\n", printed)
+    assert numbers, printed
+    run_out, coordination, overlap, carried, error, unconverged = map(float, numbers.groups())
+    assert 0.5 < run_out < 4       # collapsed, and not run off the rough floor, five widths long
+    assert 2 < coordination < 4    # of a heap at rest: some discs rattle, isostatic are 3 with friction and 4 without
+    assert 0 < overlap < 0.01 and unconverged < 10  # of some 2000; 0 when this was written
+    assert carried == pytest.approx(1, abs=0.01)  # at rest but for what half a second of settling leaves
+    assert abs(error) < 1e-9                      # rounding, summed over 1200 steps
+
+
+def test_one_version_everywhere():
+    version, = re.findall(r"project\(quicksand VERSION (\S+)", (ROOT / "CMakeLists.txt").read_text())
+    assert re.search(rf"^version: {re.escape(version)}$", (ROOT / "CITATION.cff").read_text(), re.M)
+    assert re.search(rf"^## \[{re.escape(version)}\]", (ROOT / "CHANGELOG.md").read_text(), re.M)
