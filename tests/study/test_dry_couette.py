@@ -13,7 +13,7 @@ import quicksand
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "dry_couette.py"
 FLAGS = ("--out --rate --pressure --size-ratio --height --width --friction --wall-friction --rough-walls --fixed-height --dt --t-end "
-         "--tolerance --threads --seed --quick --no-plots").split()
+         "--tolerance --threads --seed --quick --no-plots --frame-every --checkpoint-every --restart").split()
 KEYS = """n_grains h phi phi_std phi_err mu mu_std mu_err tau tau_std sigma_xx sigma_yy sigma_yy_std sigma_yy_wall_contacts
           sigma_yy_kinetic wall_pressure branch_length shear_rate_bulk inertial_number inertial_number_bulk psi6 coordination
           t_converged state max_overlap energy_error residual_max unconverged_steps steps sweeps_per_step wall_time threads""".split()
@@ -94,7 +94,7 @@ def test_figures_are_written(rough):
 
 
 def test_flat_walls_and_no_plots(tmp_path):
-    results, _ = results_of(tmp_path, "--no-plots", "--t-end", 1)
+    results, _ = results_of(tmp_path, "--no-plots", "--frame-every", 0, "--checkpoint-every", 0, "--t-end", 1)
     assert sorted(results) == sorted(KEYS) and os.listdir(tmp_path) == ["results.json"]
     assert results["branch_length"] is None or results["branch_length"] == pytest.approx(2e-3, rel=1e-3)  # one size, hardly overlapping
 
