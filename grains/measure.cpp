@@ -8,8 +8,9 @@ namespace quicksand {
 
 template <int dim>
 Profile<dim> profile(const Simulation<dim>& simulation, int axis, double low, double high, int bins) {
-  if (axis < 0 || axis >= dim || !(high > low) || bins < 1)
-    fail("profile: needs an axis of the scene, low < high [m] and at least one bin, got axis {}, {} to {} m, {} bins", axis, low, high, bins);
+  if (axis < 0 || axis >= dim) fail("profile: axis must be 0 to {}, got {}", dim - 1, axis);
+  if (!is_finite(low) || !is_finite(high) || !(high > low)) fail("profile: low < high must be finite, got {} and {} m", low, high);
+  if (bins < 1 || bins > 1000000) fail("profile: bins must be 1 to 1000000, got {}", bins);
   const Grains<dim>& grains = simulation.grains();
   Profile<dim> out;
   out.solid.assign(bins, 0.0);
@@ -19,8 +20,8 @@ Profile<dim> profile(const Simulation<dim>& simulation, int axis, double low, do
   for (int k = 0; k < grains.size(); ++k) {
     if (grains.wall[k] >= 0) continue;
     const double r = grains.r[k], y = simulation.box().wrap(grains.x[k])[axis];
-    const int first = std::max(0, static_cast<int>(std::floor((y - r - low) / thickness)));
-    const int last = std::min(bins - 1, static_cast<int>(std::floor((y + r - low) / thickness)));
+    const int first = static_cast<int>(std::clamp(std::floor((y - r - low) / thickness), 0.0, double(bins)));
+    const int last = static_cast<int>(std::clamp(std::floor((y + r - low) / thickness), -1.0, bins - 1.0));
     double below = y - r < low ? solid_below<dim>(r, low - y) : 0.0;
     for (int b = first; b <= last; ++b) {
       const double top = low + (b + 1) * thickness;
@@ -36,6 +37,7 @@ Profile<dim> profile(const Simulation<dim>& simulation, int axis, double low, do
 }
 
 double psi6(const Simulation<2>& simulation, double low, double high) {
+  if (std::isnan(low) || std::isnan(high)) fail("psi6: low and high must be numbers, got {} and {} m", low, high);
   const Grains<2>& grains = simulation.grains();
   std::vector<Vec<2>> x;
   std::vector<double> r;

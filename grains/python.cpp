@@ -14,7 +14,7 @@ using namespace py::literals;
 namespace {
 
 using namespace quicksand;
-using Array = py::array_t<double, py::array::c_style | py::array::forcecast>;
+using Array = py::array_t<double, py::array::c_style>;  // no forcecast: what loses a part, complex numbers say, is a TypeError
 
 // A C-contiguous float64 array is read in place; others are converted first.
 template <class T>
@@ -22,9 +22,25 @@ std::span<const T> as_span(const Array& a, const char* where, const char* what) 
   constexpr int width = sizeof(T) / sizeof(double);
   const bool fits = width == 1 ? a.ndim() == 1 : (a.ndim() == 2 && a.shape(1) == width);
   if (!fits)
-    fail("{}: {} must be an array of shape {}", where, what,
-                                            width == 1 ? std::string("(n,)") : fmt::format("(n, {})", width));
+    fail("{}: {} must be an array of shape {}, got ({})", where, what,
+         width == 1 ? std::string("(n,)") : fmt::format("(n, {})", width), fmt::join(a.shape(), a.shape() + a.ndim(), ", "));
   return {reinterpret_cast<const T*>(a.data()), static_cast<std::size_t>(a.shape(0))};
+}
+
+// The same where None stands for zeros: an empty array is not None.
+template <class T>
+std::span<const T> as_span(const std::optional<Array>& a, const char* where, const char* what, std::size_t n) {
+  if (!a) return {};
+  const auto values = as_span<T>(*a, where, what);
+  if (values.empty() && n > 0) fail("{}: one {} per grain, got 0 for {} grains", where, what, n);
+  return values;
+}
+
+template <int dim>
+Vec<dim> as_vector(const Array& a, const char* where, const char* what) {
+  if (a.ndim() != 1 || a.shape(0) != dim)
+    fail("{}: {} must have shape ({},), got ({})", where, what, dim, fmt::join(a.shape(), a.shape() + a.ndim(), ", "));
+  return Eigen::Map<const Vec<dim>>(a.data());
 }
 
 // Hands a vector to numpy without copying it.
@@ -37,6 +53,21 @@ Array to_numpy(std::vector<T>&& values) {
   return Array(shape, reinterpret_cast<const double*>(kept->data()), owner);
 }
 
+// A radius for each of n grains, from one for all or an array.
+Array radii(const py::object& radius, std::size_t n, const char* where) {
+  const Array r = Array::ensure(radius);
+  if (!r) throw py::type_error(fmt::format("{}: radius must be a number or an array of shape (n,), got {}", where,
+                                           std::string(py::repr(radius))));
+  return r.ndim() == 0 ? to_numpy(std::vector<double>(n, *r.data())) : r;
+}
+
+template <int dim>
+Vec<dim> finite_gravity(const Array& a) {
+  const Vec<dim> g = as_vector<dim>(a, "Simulation", "gravity");
+  if (!is_finite(g.norm())) fail("Simulation: gravity must be finite, got ({}) m/s^2", fmt::join(g, ", "));
+  return g;
+}
+
 template <int dim>
 struct WallHandle {
   py::object owner;  // keeps the simulation alive
@@ -47,21 +78,32 @@ struct WallHandle {
 
 using PerAxis = std::optional<std::vector<std::optional<double>>>;
 
-// velocity and load per axis -> drive() and load(); an axis with neither is held.
-template <int dim>
-WallHandle<dim> driven(py::object self, int number, const PerAxis& velocity, const PerAxis& load, std::optional<double> mass) {
-  auto* simulation = self.cast<Simulation<dim>*>();
-  for (const auto* axes : {&velocity, &load})
+// A wall from `add`, with velocity and load per axis -> drive() and set_load(); an axis with neither is held. All is checked before
+// there is a wall: none stays behind when something is wrong.
+template <int dim, class Add>
+WallHandle<dim> add_driven(const py::object& self, const char* where, const PerAxis& velocity, const PerAxis& load,
+                           std::optional<double> mass, Add&& add) {
+  auto& simulation = self.cast<Simulation<dim>&>();
+  for (const auto& [axes, name] : {std::pair{&velocity, "velocity"}, std::pair{&load, "load"}})
     if (*axes && (*axes)->size() != dim)
-      fail("wall: velocity and load need one entry per axis ({}), None where not driven", dim);
+      fail("{}: {} needs one entry per axis ({}), None where not driven, got {}", where, name, dim, (*axes)->size());
+  bool loaded = false;
+  auto of_axis = [](const PerAxis& axes, int k) { return axes ? (*axes)[k] : std::nullopt; };
   for (int k = 0; k < dim; ++k) {
-    const bool by_velocity = velocity && (*velocity)[k], by_load = load && (*load)[k];
-    if (by_velocity && by_load)
-      fail("wall: axis {} is driven by velocity and by load; give one of them", k);
-    if (by_load) simulation->load(number, k, *(*load)[k], mass);
-    else simulation->drive(number, k, by_velocity ? *(*velocity)[k] : 0.0);
+    const auto v = of_axis(velocity, k), f = of_axis(load, k);
+    if (v && f) fail("{}: axis {} is driven by velocity ({} m/s) and by load ({} N); give one of them", where, k, *v, *f);
+    if (v && !is_finite(*v)) fail("{}: velocity must be finite, got {} m/s (axis {})", where, *v, k);
+    if (f && !is_finite(*f)) fail("{}: load must be finite, got {} N (axis {})", where, *f, k);
+    loaded |= f.has_value();
   }
-  return {self, simulation, number};
+  if (mass) check_positive(*mass, fmt::format("{}: mass", where), "kg");
+  if (mass && !loaded) fail("{}: mass is that of load-driven axes, and no axis has a load, got {} kg", where, *mass);
+  const int number = add(simulation);
+  for (int k = 0; k < dim; ++k) {
+    if (const auto f = of_axis(load, k)) simulation.set_load(number, k, *f, mass);
+    else simulation.drive(number, k, of_axis(velocity, k).value_or(0.0));
+  }
+  return {self, &simulation, number};
 }
 
 Solver solver_named(const std::string& name) {
@@ -117,19 +159,18 @@ void bind(py::module_& m, const char* suffix) {
       .def_property_readonly("mass", [](const Handle& h) { return h.wall().mass; },
                              "of load-driven axes [kg] (2D: kg/m); 0: set at the first step")
       .def("drive", [](const Handle& h, int axis, double velocity) { h.simulation->drive(h.number, axis, velocity); }, "axis"_a, "velocity"_a, "From now on drive an axis by velocity [m/s].")
-      .def("set_load", [](const Handle& h, int axis, double load) { h.simulation->load(h.number, axis, load, std::nullopt); }, "axis"_a, "load"_a, "From now on drive an axis by load [N] (2D: N/m).");
+      .def("set_load", [](const Handle& h, int axis, double load) { h.simulation->set_load(h.number, axis, load, std::nullopt); }, "axis"_a, "load"_a, "From now on drive an axis by load [N] (2D: N/m).");
 
-  py::class_<Sim>(m, named("Simulation").c_str(), "A scene of grains and walls; made by Simulation(dim=...).")
+  py::class_<Sim> simulation(m, named("Simulation").c_str(), "A scene of grains and walls; made by Simulation(dim=...).");
+  simulation
       .def("add",
            [](Sim& s, const Array& x, const py::object& radius, double density, const std::optional<Array>& velocity,
               const std::optional<Array>& spin, const std::string& material) {
              const auto xs = as_span<Vec<dim>>(x, "add", "position");
-             Array r = py::isinstance<py::float_>(radius) || py::isinstance<py::int_>(radius)
-                           ? to_numpy(std::vector<double>(xs.size(), radius.cast<double>()))
-                           : radius.cast<Array>();
+             const Array r = radii(radius, xs.size(), "add");
              const int first = s.add(xs, as_span<double>(r, "add", "radius"), density,
-                                     velocity ? as_span<Vec<dim>>(*velocity, "add", "velocity") : std::span<const Vec<dim>>{},
-                                     spin ? as_span<Spin<dim>>(*spin, "add", "spin") : std::span<const Spin<dim>>{}, material);
+                                     as_span<Vec<dim>>(velocity, "add", "velocity", xs.size()),
+                                     as_span<Spin<dim>>(spin, "add", "spin", xs.size()), material);
              return py::make_tuple(first, s.count());
            },
            "position"_a, "radius"_a, "density"_a = 1000.0, "velocity"_a = py::none(), "spin"_a = py::none(),
@@ -139,10 +180,11 @@ void bind(py::module_& m, const char* suffix) {
            "Returns\n-------\n(first, last + 1) : ids of the new grains\n\nRaises\n------\nValueError : a radius <= 0, values that are "
            "not finite, an unknown material, a period below four diameters")
       .def("add_plane",
-           [](py::object self, const Vec<dim>& point, const Vec<dim>& normal, const std::string& material,
+           [](const py::object& self, const Array& point, const Array& normal, const std::string& material,
               const PerAxis& velocity, const PerAxis& load, std::optional<double> mass) {
-             const int w = self.cast<Sim*>()->add_plane(point, normal, material);
-             return driven<dim>(self, w, velocity, load, mass);
+             return add_driven<dim>(self, "add_plane", velocity, load, mass, [&](Sim& s) {
+               return s.add_plane(as_vector<dim>(point, "add_plane", "point"), as_vector<dim>(normal, "add_plane", "normal"), material);
+             });
            },
            "point"_a, "normal"_a, "material"_a = "wall", "velocity"_a = py::none(), "load"_a = py::none(), "mass"_a = py::none(),
            "Add a plane wall; the grains are on the side its normal points to.\n\n"
@@ -155,21 +197,24 @@ void bind(py::module_& m, const char* suffix) {
       .def("set_inertia", &Sim::set_inertia, "ratio"_a, "I/(m r^2) of every grain [-]; default 1/2 in 2D, 2/5 in 3D.")
       .def("attach",
            [](Sim& s, const Handle& wall, const Array& x, const py::object& radius, const std::string& material) {
+             if (wall.simulation != &s) fail("attach: wall {} belongs to another simulation", wall.number);
              const auto xs = as_span<Vec<dim>>(x, "attach", "position");
-             Array r = py::isinstance<py::float_>(radius) || py::isinstance<py::int_>(radius)
-                           ? to_numpy(std::vector<double>(xs.size(), radius.cast<double>()))
-                           : radius.cast<Array>();
+             const Array r = radii(radius, xs.size(), "attach");
              s.attach(wall.number, xs, as_span<double>(r, "attach", "radius"), material);
            },
            "wall"_a, "position"_a, "radius"_a, "material"_a = "grain",
            "Fix grains to a wall, which they make rough: (n, dim) [m], (n,) or float [m]. They move with it and do not count as grains.")
+      .def("check", &Sim::check, "dt"_a,
+           "Raise what step(dt) would refuse: a ValueError on overlaps, walls that cross, pairs of materials without friction...")
       .def("step",
            [](Sim& s, double dt) {
              py::gil_scoped_release release;
              return s.step(dt);
            },
            "dt"_a, "Advance by dt [s], in as many sub-steps as the motion asks for. Returns a StepReport.\n\n"
-           "Raises NotConverged when a sub-step misses its tolerance, unless accept_unconverged.")
+           "Raises\n------\nValueError : dt <= 0; where things were put since the last step: overlaps deeper than the smaller radius, grains "
+           "behind a\n    wall, walls that cross. Nothing has moved then\n"
+           "NotConverged : a sub-step misses its tolerance, unless accept_unconverged")
       .def("profile",
            [](const Sim& s, int axis, double low, double high, int bins) {
              Profile<dim> p = profile(s, axis, low, high, bins);
@@ -207,83 +252,74 @@ void bind(py::module_& m, const char* suffix) {
       .def_property_readonly("memory", &Sim::memory, "bytes held for grains and contacts")
       .def_property_readonly("detections", [](const Sim& s) { return s.neighbours().found; }, "times neighbours were found anew")
       .def_property_readonly("period", [](const Sim& s) { return s.box().period; }, "(dim,) [m]; 0: not periodic")
-      .def_readwrite("gravity", &Sim::gravity, "(dim,) [m/s^2]; assign a whole vector")
+      .def_property("gravity", [](const Sim& s) { return s.gravity; },
+                    [](Sim& s, const Array& a) { s.gravity = finite_gravity<dim>(a); }, "(dim,) [m/s^2], a copy; assign a whole vector")
       .def_property("position",
                     [](const Sim& s) { return to_numpy(s.by_id([&](const Grains<dim>& g, int k) { return Vec<dim>(s.box().wrap(g.x[k])); })); },
-                    [](Sim& s, const Array& a) { s.set_position(as_span<Vec<dim>>(a, "position", "position")); },
+                    [](Sim& s, const Array& a) { s.set_position(as_span<Vec<dim>>(a, "set_position", "position")); },
                     "(n, dim) [m], a copy; periodic axes in [-L/2, L/2)")
       .def_property("velocity",
                     [](const Sim& s) { return to_numpy(s.by_id([](const Grains<dim>& g, int k) { return Vec<dim>(g.body[k].v); })); },
-                    [](Sim& s, const Array& a) { s.set_velocity(as_span<Vec<dim>>(a, "velocity", "velocity")); },
+                    [](Sim& s, const Array& a) { s.set_velocity(as_span<Vec<dim>>(a, "set_velocity", "velocity")); },
                     "(n, dim) [m/s], a copy")
       .def_property("spin",
                     [](const Sim& s) { return to_numpy(s.by_id([](const Grains<dim>& g, int k) { return Spin<dim>(g.body[k].s / g.r[k]); })); },
-                    [](Sim& s, const Array& a) { s.set_omega(as_span<Spin<dim>>(a, "spin", "spin")); },
+                    [](Sim& s, const Array& a) { s.set_spin(as_span<Spin<dim>>(a, "set_spin", "spin")); },
                     "angular velocity, (n,) in 2D, (n, 3) in 3D [rad/s], a copy")
       .def_property_readonly("radius", [](const Sim& s) { return to_numpy(s.by_id([](const Grains<dim>& g, int k) { return g.r[k]; })); },
                              "(n,) [m], a copy")
       .def_property_readonly("mass", [](const Sim& s) { return to_numpy(s.by_id([](const Grains<dim>& g, int k) { return 1.0 / g.body[k].inv_m; })); },
                              "(n,) [kg] (2D: kg/m), a copy")
       .def("set_force", [](Sim& s, const std::optional<Array>& f) {
-             s.set_force(f ? as_span<Vec<dim>>(*f, "set_force", "force") : std::span<const Vec<dim>>{});
+             s.set_force(as_span<Vec<dim>>(f, "set_force", "force", s.count()));
            }, "force"_a, "External force on each grain from now on, (n, dim) [N] (2D: N/m); None: none.")
-      .def_property("tolerance", [](const Sim& s) { return s.settings.solve.tolerance; },
-                    [](Sim& s, double v) {
-                      if (!(v > 0)) fail("tolerance: must be > 0, got {}", v);
-                      s.settings.solve.tolerance = v;
-                    }, "of every sub-step, on the residual [-]; no contact may be wrong by more than tolerance/20 mean diameters")
-      .def_property("max_sweeps", [](const Sim& s) { return s.settings.solve.max_sweeps; },
-                    [](Sim& s, int v) {
-                      if (v < 1) fail("max_sweeps: must be >= 1, got {}", v);
-                      s.settings.solve.max_sweeps = v;
-                    }, "before the fallback, and again as many for it")
-      .def_property("omega", [](const Sim& s) { return s.settings.solve.omega; },
-                    [](Sim& s, double v) {
-                      if (!(v >= 1 && v < 2)) fail("omega: must be in [1, 2), got {}", v);
-                      s.settings.solve.omega = v;
-                    }, "over-relaxation to start from [-]")
-      .def_property("active_sweeps", [](const Sim& s) { return s.settings.solve.active_sweeps; },
-                    [](Sim& s, int v) {
-                      if (v < 1) fail("active_sweeps: must be >= 1, got {}", v);
-                      s.settings.solve.active_sweeps = v;
-                    }, "over unsettled contacts between sweeps over all")
-      .def_property("sub_step_motion", [](const Sim& s) { return s.settings.sub_step_motion; },
-                    [](Sim& s, double v) {
-                      if (!(v > 0 && v <= 0.5)) fail("sub_step_motion: must be in (0, 0.5], got {}", v);
-                      s.settings.sub_step_motion = v;
-                    }, "largest motion of a pair in a sub-step over the distance of its centres [-]")
-      .def_property("rest_speed", [](const Sim& s) { return s.settings.rest_speed; },
-                    [](Sim& s, double v) {
-                      if (!(v >= 0)) fail("rest_speed: must be >= 0 m/s, got {}", v);
-                      s.settings.rest_speed = v;
-                    }, "contacts that approach more slowly do not rebound [m/s]")
       .def_property("solver", [](const Sim& s) { return s.settings.solver == Solver::nlgs ? "nlgs" : "active_set"; },
                     [](Sim& s, const std::string& v) { s.settings.solver = solver_named(v); }, "'active_set' or 'nlgs'")
       .def_property("sub_step_rule", [](const Sim& s) { return s.settings.sub_steps == SubSteps::relative ? "relative" : "absolute"; },
                     [](Sim& s, const std::string& v) { s.settings.sub_steps = sub_steps_named(v); },
-                    "'relative': motion of neighbours; 'absolute': ceil(8 v_max dt/r_min), the rule of the MigFlow thesis")
-      .def_property("accept_unconverged", [](const Sim& s) { return s.settings.accept_unconverged; },
-                    [](Sim& s, bool v) { s.settings.accept_unconverged = v; },
-                    "go on after a sub-step that missed its tolerance; such sub-steps are counted in the report")
-      .def_property("threads", [](const Sim& s) { return s.settings.threads; },
-                    [](Sim& s, int v) {
-                      if (v < 1) fail("threads: must be >= 1, got {}", v);
-                      s.settings.threads = v;
-                    }, "at most; fewer where more would be slower. Results do not depend on it, bit for bit");
+                    "'relative': motion of neighbours; 'absolute': ceil(8 v_max dt/r_min), the rule of the MigFlow thesis");
+
+  // Settings are checked together before any of them counts.
+  auto setting = [&](const char* name, auto field, const char* doc) {
+    using Value = std::decay_t<decltype(field(std::declval<Settings&>()))>;
+    auto set = [field](Sim& s, Value value) {
+      Settings next = s.settings;
+      field(next) = value;
+      check(next, "Simulation");
+      s.settings = next;
+    };
+    simulation.def_property(name, [field](Sim& s) { return field(s.settings); },
+                            py::cpp_function(set, py::name(name), py::is_method(simulation)), doc);
+  };
+  setting("tolerance", [](Settings& s) -> double& { return s.solve.tolerance; },
+          "of every sub-step, on the residual [-]; no contact may be wrong by more than tolerance/20 mean diameters");
+  setting("max_sweeps", [](Settings& s) -> int& { return s.solve.max_sweeps; },
+          "before the fallback, and again as many for it");
+  setting("omega", [](Settings& s) -> double& { return s.solve.omega; },
+          "over-relaxation to start from [-]");
+  setting("active_sweeps", [](Settings& s) -> int& { return s.solve.active_sweeps; },
+          "over unsettled contacts between sweeps over all");
+  setting("sub_step_motion", [](Settings& s) -> double& { return s.sub_step_motion; },
+          "largest motion of a pair in a sub-step over the distance of its centres [-]");
+  setting("rest_speed", [](Settings& s) -> double& { return s.rest_speed; },
+          "contacts that approach more slowly do not rebound [m/s]");
+  setting("accept_unconverged", [](Settings& s) -> bool& { return s.accept_unconverged; },
+          "go on after a sub-step that missed its tolerance; such sub-steps are counted in the report");
+  setting("threads", [](Settings& s) -> int& { return s.threads; },
+          "at most; fewer where more would be slower. Results do not depend on it, bit for bit");
 }
 
 template <int dim>
-py::object make(const std::optional<std::vector<std::optional<double>>>& period, const py::object& gravity) {
+py::object make(const PerAxis& period, const std::optional<Array>& gravity) {
   Vec<dim> lengths = Vec<dim>::Zero();
   if (period) {
     if (period->size() != dim)
-      fail("Simulation: period needs one entry per axis ({}), None where not periodic", dim);
+      fail("Simulation: period needs one entry per axis ({}), None where not periodic, got {}", dim, period->size());
     for (int k = 0; k < dim; ++k) lengths[k] = (*period)[k].value_or(0.0);
   }
   auto simulation = std::make_unique<Simulation<dim>>(lengths);
-  if (!gravity.is_none()) simulation->gravity = gravity.cast<Vec<dim>>();
-  if (!simulation->gravity.allFinite()) fail("Simulation: gravity [m/s^2] must be finite");
-  simulation->settings.threads = omp_get_max_threads();
+  if (gravity) simulation->gravity = finite_gravity<dim>(*gravity);
+  simulation->settings.threads = std::min(omp_get_max_threads(), 1024);
   return py::cast(std::move(simulation));
 }
 
@@ -296,10 +332,11 @@ PYBIND11_MODULE(_grains, m) {
   bind<2>(m, "2D");
   bind<3>(m, "3D");
   m.attr("Simulation2D").attr("add_segment") = py::cpp_function(
-      [](py::object self, const Vec<2>& start, const Vec<2>& end, const std::string& material, const PerAxis& velocity,
+      [](const py::object& self, const Array& start, const Array& end, const std::string& material, const PerAxis& velocity,
          const PerAxis& load, std::optional<double> mass) {
-        const int w = self.cast<Simulation<2>*>()->add_segment(start, end, material);
-        return driven<2>(self, w, velocity, load, mass);
+        return add_driven<2>(self, "add_segment", velocity, load, mass, [&](Simulation<2>& s) {
+          return s.add_segment(as_vector<2>(start, "add_segment", "start"), as_vector<2>(end, "add_segment", "end"), material);
+        });
       },
       py::name("add_segment"), py::is_method(m.attr("Simulation2D")), "start"_a, "end"_a, "material"_a = "wall",
       "velocity"_a = py::none(), "load"_a = py::none(), "mass"_a = py::none(),
@@ -310,8 +347,7 @@ PYBIND11_MODULE(_grains, m) {
       "1.3 (r_i + r_j) [-].");
   m.def(
       "Simulation",
-      [](int dim, const std::optional<std::vector<std::optional<double>>>& period, const py::object& gravity,
-         const py::kwargs& settings) {
+      [](int dim, const PerAxis& period, const std::optional<Array>& gravity, const py::kwargs& settings) {
         if (dim != 2 && dim != 3) fail("Simulation: dim must be 2 or 3, got {}", dim);
         py::object simulation = dim == 2 ? make<2>(period, gravity) : make<3>(period, gravity);
         for (const auto& [name, value] : settings) {

@@ -7,7 +7,7 @@ namespace quicksand {
 namespace {
 
 void check_finite(double value, const char* where, const char* what, std::size_t at) {
-  if (!std::isfinite(value)) fail("{}: {} must be finite, got {} (grain {})", where, what, value, at);
+  if (!is_finite(value)) fail("{}: {} must be finite, got {} (grain {})", where, what, value, at);
 }
 template <int n>
 void check_finite(const Vec<n>& value, const char* where, const char* what, std::size_t at) {
@@ -15,6 +15,19 @@ void check_finite(const Vec<n>& value, const char* where, const char* what, std:
 }
 
 }  // namespace
+
+void check(const Settings& settings, const char* where) {
+  const SolverSettings& solve = settings.solve;
+  if (settings.threads < 1 || settings.threads > 1024) fail("{}: threads must be 1 to 1024, got {}", where, settings.threads);
+  if (!(solve.tolerance > 0 && solve.tolerance <= 1)) fail("{}: tolerance must be in (0, 1], got {}", where, solve.tolerance);
+  if (solve.max_sweeps < 1) fail("{}: max_sweeps must be >= 1, got {}", where, solve.max_sweeps);
+  if (solve.active_sweeps < 1) fail("{}: active_sweeps must be >= 1, got {}", where, solve.active_sweeps);
+  if (!(solve.omega >= 1 && solve.omega < 2)) fail("{}: omega must be in [1, 2), got {}", where, solve.omega);
+  if (!(settings.sub_step_motion > 0 && settings.sub_step_motion <= 0.5))
+    fail("{}: sub_step_motion must be in (0, 0.5], got {}", where, settings.sub_step_motion);
+  if (!(settings.rest_speed >= 0 && is_finite(settings.rest_speed)))
+    fail("{}: rest_speed must be >= 0 m/s and finite, got {}", where, settings.rest_speed);
+}
 
 std::uint8_t Materials::find(const std::string& name, const char* where) const {
   const auto at = std::find(names_.begin(), names_.end(), name);
@@ -27,7 +40,6 @@ std::uint8_t Materials::find(const std::string& name, const char* where) const {
 std::uint8_t Materials::find_or_add(const std::string& name) {
   const auto at = std::find(names_.begin(), names_.end(), name);
   if (at != names_.end()) return static_cast<std::uint8_t>(at - names_.begin());
-  if (names_.size() == 255) fail("set_friction: at most 255 materials, '{}' is one more", name);
   names_.push_back(name);
   pairs_.resize(names_.size() * (names_.size() + 1) / 2);
   return static_cast<std::uint8_t>(names_.size() - 1);
@@ -36,27 +48,42 @@ std::uint8_t Materials::find_or_add(const std::string& name) {
 template <int dim>
 Simulation<dim>::Simulation(const Vec<dim>& period) {
   for (int k = 0; k < dim; ++k)
-    if (!std::isfinite(period[k]) || period[k] < 0)
+    if (!is_finite(period[k]) || period[k] < 0)
       fail("Simulation: period must be > 0 m, or 0 along axes that are not periodic, got {} (axis {})", period[k], k);
   box_.period = period;
+}
+
+template <int dim>
+void Simulation<dim>::check_grains(std::span<const Vec<dim>> x, std::span<const double> radius, const char* where) const {
+  if (radius.size() != x.size()) fail("{}: one radius per grain, got {} for {} grains", where, radius.size(), x.size());
+  const std::string what = fmt::format("{}: radius", where);
+  for (std::size_t k = 0; k < x.size(); ++k) {
+    check_positive(radius[k], what, "m", static_cast<std::ptrdiff_t>(k));
+    for (int axis = 0; axis < dim; ++axis)
+      if (box_.period[axis] > 0 && box_.period[axis] < 8 * radius[k])
+        fail("{}: a period must be at least four diameters, got {} m for radius {} m (grain {})", where, box_.period[axis],
+             radius[k], k);
+    check_finite(x[k], where, "position [m]", k);
+  }
+}
+
+// What was known of places holds no longer: grains or walls were added or moved from outside.
+template <int dim>
+void Simulation<dim>::places_changed() {
+  neighbours_.forget();
+  places_checked_ = false;
 }
 
 template <int dim>
 int Simulation<dim>::add(std::span<const Vec<dim>> x, std::span<const double> radius, double density,
                          std::span<const Vec<dim>> velocity, std::span<const Spin<dim>> omega, const std::string& material) {
   const std::size_t n = x.size();
-  if (radius.size() != n) fail("add: one radius per grain, got {} for {} grains", radius.size(), n);
   if (!velocity.empty() && velocity.size() != n) fail("add: one velocity per grain, got {} for {} grains", velocity.size(), n);
   if (!omega.empty() && omega.size() != n) fail("add: one spin per grain, got {} for {} grains", omega.size(), n);
-  if (!(density > 0) || !std::isfinite(density)) fail("add: density must be > 0 kg/m^3, got {}", density);
+  check_positive(density, "add: density", "kg/m^3");
+  check_grains(x, radius, "add");
   const std::uint8_t m = materials_.find(material, "add");
   for (std::size_t k = 0; k < n; ++k) {
-    if (!(radius[k] > 0) || !std::isfinite(radius[k])) fail("add: radius must be > 0 m, got {} (grain {})", radius[k], k);
-    for (int axis = 0; axis < dim; ++axis)
-      if (box_.period[axis] > 0 && box_.period[axis] < 8 * radius[k])
-        fail("add: a period must be at least four diameters, got {} m for radius {} m (grain {})", box_.period[axis],
-             radius[k], k);
-    check_finite(x[k], "add", "position [m]", k);
     if (!velocity.empty()) check_finite(velocity[k], "add", "velocity [m/s]", k);
     if (!omega.empty()) check_finite(std::sqrt(squared(omega[k])), "add", "spin [rad/s]", k);
   }
@@ -74,35 +101,42 @@ int Simulation<dim>::add(std::span<const Vec<dim>> x, std::span<const double> ra
     grains_.material.push_back(m);
   }
   if (!grains_.force.empty()) grains_.force.resize(grains_.x.size(), Vec<dim>::Zero());
-  neighbours_.forget();
+  places_changed();
   return first;
 }
 
 template <int dim>
 int Simulation<dim>::add_plane(const Vec<dim>& point, const Vec<dim>& normal, const std::string& material) {
-  if (!point.allFinite()) fail("add_plane: point [m] must be finite");
-  if (!normal.allFinite() || !(normal.norm() > 0)) fail("add_plane: normal must be finite and not zero");
+  const std::string got = fmt::format("{}", fmt::join(normal, ", "));
+  if (!is_finite(point.norm())) fail("add_plane: point [m] must be finite, got ({})", fmt::join(point, ", "));
+  if (!is_finite(normal.norm()) || !(normal.norm() > 1e-30)) fail("add_plane: normal must be finite and not zero, got ({})", got);
   Wall<dim> wall;
   wall.point = point;
   wall.normal = normal.normalized();
-  wall.material = materials_.find(material, "add_plane");
-  walls_.push_back(wall);
-  neighbours_.forget();
-  return static_cast<int>(walls_.size()) - 1;
+  for (int k = 0; k < dim; ++k)  // a grain that goes through the boundary would come out behind such a plane
+    if (box_.period[k] > 0 && std::abs(wall.normal[k]) > 1e-9)
+      fail("add_plane: normal must be 0 along a periodic axis, got ({}) (axis {}, period {} m)", got, k, box_.period[k]);
+  return add_wall(wall, material, "add_plane");
 }
 
 template <int dim>
 int Simulation<dim>::add_segment(const Vec<dim>& start, const Vec<dim>& end, const std::string& material) {
   if (dim != 2) fail("add_segment: segments are walls of 2D scenes");
-  if (!start.allFinite() || !end.allFinite() || !((end - start).norm() > 0))
-    fail("add_segment: start and end [m] must be finite and apart");
+  if (!is_finite(start.norm()) || !is_finite(end.norm()) || !((end - start).norm() > 1e-30))
+    fail("add_segment: start and end [m] must be finite and apart, got ({}) and ({})", fmt::join(start, ", "), fmt::join(end, ", "));
   Wall<dim> wall;
   wall.shape = Wall<dim>::Shape::segment;
   wall.point = start;
   wall.span = end - start;
-  wall.material = materials_.find(material, "add_segment");
+  return add_wall(wall, material, "add_segment");
+}
+
+template <int dim>
+int Simulation<dim>::add_wall(Wall<dim>& wall, const std::string& material, const char* where) {
+  wall.material = materials_.find(material, where);
+  if (walls_.size() == 32767) fail("{}: at most 32767 walls", where);  // Grains::wall is that wide
   walls_.push_back(wall);
-  neighbours_.forget();
+  places_changed();
   return static_cast<int>(walls_.size()) - 1;
 }
 
@@ -116,17 +150,17 @@ void Simulation<dim>::check_wall(int wall, const char* where, int axis) const {
 template <int dim>
 void Simulation<dim>::drive(int wall, int axis, double velocity) {
   check_wall(wall, "drive", axis);
-  if (!std::isfinite(velocity)) fail("drive: velocity must be finite, got {} m/s (wall {}, axis {})", velocity, wall, axis);
+  if (!is_finite(velocity)) fail("drive: velocity must be finite, got {} m/s (wall {}, axis {})", velocity, wall, axis);
   walls_[wall].loaded[axis] = false;
   walls_[wall].inv_m[axis] = walls_[wall].load[axis] = 0.0;
   walls_[wall].v[axis] = velocity;
 }
 
 template <int dim>
-void Simulation<dim>::load(int wall, int axis, double force, std::optional<double> mass) {
-  check_wall(wall, "load", axis);
-  if (!std::isfinite(force)) fail("load: load must be finite, got {} N (wall {}, axis {})", force, wall, axis);
-  if (mass && (!(*mass > 0) || !std::isfinite(*mass))) fail("load: mass must be > 0 kg, got {} (wall {})", *mass, wall);
+void Simulation<dim>::set_load(int wall, int axis, double force, std::optional<double> mass) {
+  check_wall(wall, "set_load", axis);
+  if (!is_finite(force)) fail("set_load: load must be finite, got {} N (wall {}, axis {})", force, wall, axis);
+  if (mass) check_positive(*mass, "set_load: mass", "kg");
   walls_[wall].loaded[axis] = true;
   walls_[wall].load[axis] = force;
   if (mass) walls_[wall].mass = *mass;
@@ -136,12 +170,8 @@ template <int dim>
 void Simulation<dim>::attach(int wall, std::span<const Vec<dim>> x, std::span<const double> radius,
                              const std::string& material) {
   check_wall(wall, "attach");
-  if (radius.size() != x.size()) fail("attach: one radius per grain, got {} for {} grains", radius.size(), x.size());
+  check_grains(x, radius, "attach");
   const std::uint8_t m = materials_.find(material, "attach");
-  for (std::size_t k = 0; k < x.size(); ++k) {
-    if (!(radius[k] > 0) || !std::isfinite(radius[k])) fail("attach: radius must be > 0 m, got {} (grain {})", radius[k], k);
-    check_finite(x[k], "attach", "position [m]", k);
-  }
   for (std::size_t k = 0; k < x.size(); ++k) {
     Body<dim> body{};
     body.v = walls_[wall].v;
@@ -154,12 +184,16 @@ void Simulation<dim>::attach(int wall, std::span<const Vec<dim>> x, std::span<co
     grains_.material.push_back(m);
   }
   if (!grains_.force.empty()) grains_.force.resize(grains_.x.size(), Vec<dim>::Zero());
-  neighbours_.forget();
+  places_changed();
 }
 
 template <int dim>
 void Simulation<dim>::set_friction(const std::string& a, const std::string& b, double friction) {
-  if (!(friction >= 0) || !std::isfinite(friction)) fail("set_friction: friction must be >= 0, got {} ('{}' on '{}')", friction, a, b);
+  if (!(friction >= 0) || !is_finite(friction)) fail("set_friction: friction must be >= 0 and finite, got {} ('{}' on '{}')", friction, a, b);
+  if (a.empty() || b.empty()) fail("set_friction: a material needs a name, got '{}' and '{}'", a, b);
+  const auto& names = materials_.names();
+  auto is_new = [&](const std::string& name) { return std::find(names.begin(), names.end(), name) == names.end(); };
+  if (names.size() + is_new(a) + (b != a && is_new(b)) > 255) fail("set_friction: at most 255 materials, got '{}' and '{}'", a, b);
   const int i = materials_.find_or_add(a), j = materials_.find_or_add(b);
   materials_.pair(i, j).friction = friction;
 }
@@ -176,7 +210,7 @@ void Simulation<dim>::set_restitution(const std::string& a, const std::string& b
 
 template <int dim>
 void Simulation<dim>::set_inertia(double ratio) {
-  if (!(ratio > 0 && ratio <= 1)) fail("set_inertia: I/(m r^2) must be in (0, 1], got {}", ratio);
+  if (!(ratio > 1e-30 && ratio <= 1)) fail("set_inertia: I/(m r^2) must be in (0, 1], got {}", ratio);
   grains_.inertia = ratio;
 }
 
@@ -201,7 +235,7 @@ void Simulation<dim>::set_position(std::span<const Vec<dim>> x) {
   for (std::size_t k = 0; k < x.size(); ++k) check_finite(x[k], "set_position", "position [m]", k);
   for (int k = 0; k < grains_.size(); ++k)
     if (grains_.id[k] >= 0) grains_.x[k] = x[grains_.id[k]];
-  neighbours_.forget();
+  places_changed();
 }
 
 template <int dim>
@@ -213,10 +247,10 @@ void Simulation<dim>::set_velocity(std::span<const Vec<dim>> v) {
 }
 
 template <int dim>
-void Simulation<dim>::set_omega(std::span<const Spin<dim>> omega) {
-  set_by_id(omega.size(), "set_omega", "spin");
+void Simulation<dim>::set_spin(std::span<const Spin<dim>> omega) {
+  set_by_id(omega.size(), "set_spin", "spin");
   for (std::size_t k = 0; k < omega.size(); ++k)
-    check_finite(std::sqrt(squared(omega[k])), "set_omega", "spin [rad/s]", k);
+    check_finite(std::sqrt(squared(omega[k])), "set_spin", "spin [rad/s]", k);
   for (int k = 0; k < grains_.size(); ++k)
     if (grains_.id[k] >= 0) grains_.body[k].s = grains_.r[k] * omega[grains_.id[k]];
 }

@@ -26,6 +26,8 @@ struct Settings {
   int threads = 1;                  // at most; fewer where more would be slower. Results do not depend on it
 };
 
+void check(const Settings& settings, const char* where);  // throws std::invalid_argument
+
 // A sub-step missed its tolerance after all sweeps and the fallback. The scene has taken the sub-step all the same.
 struct NotConverged : std::runtime_error {
   using std::runtime_error::runtime_error;
@@ -79,14 +81,15 @@ class Simulation {
           std::span<const Spin<dim>> omega, const std::string& material);
   int add_plane(const Vec<dim>& point, const Vec<dim>& normal, const std::string& material);
   int add_segment(const Vec<dim>& start, const Vec<dim>& end, const std::string& material);
-  void drive(int wall, int axis, double velocity);                            // [m/s]
-  void load(int wall, int axis, double force, std::optional<double> mass);    // [N], [kg]
+  void drive(int wall, int axis, double velocity);                                // [m/s]
+  void set_load(int wall, int axis, double force, std::optional<double> mass);    // [N], [kg]
   void attach(int wall, std::span<const Vec<dim>> x, std::span<const double> radius, const std::string& material);
   void set_friction(const std::string& a, const std::string& b, double friction);
   void set_restitution(const std::string& a, const std::string& b, double normal, double tangential);
   void set_inertia(double ratio);                                             // I/(m r^2) [-]
   void set_force(std::span<const Vec<dim>> force);                            // by id [N]; empty: none
 
+  void check(double dt);  // throws what step(dt) would refuse, and changes nothing
   StepReport<dim> step(double dt);
 
   // All that the next step depends on, the number of threads left out, as bytes for restore() of a scene of the same version and dimension.
@@ -112,7 +115,7 @@ class Simulation {
   }
   void set_position(std::span<const Vec<dim>> x);
   void set_velocity(std::span<const Vec<dim>> v);
-  void set_omega(std::span<const Spin<dim>> omega);
+  void set_spin(std::span<const Spin<dim>> omega);
 
  private:
   struct Motion {
@@ -130,7 +133,10 @@ class Simulation {
 
   template <class Archive>
   void visit_state(Archive&& archive);
-  void prepare();
+  void check_places() const;
+  void places_changed();
+  int add_wall(Wall<dim>& wall, const std::string& material, const char* where);
+  void free_walls();
   int choose_threads();
   Motion measure_pairs();
   void repair_overlaps(double allowed);
@@ -143,6 +149,7 @@ class Simulation {
   void move(double h);
   void set_by_id(std::size_t size, const char* where, const char* what) const;
   void check_wall(int wall, const char* where, int axis = 0) const;
+  void check_grains(std::span<const Vec<dim>> x, std::span<const double> radius, const char* where) const;
 
   Box<dim> box_;
   Grains<dim> grains_;
@@ -152,6 +159,7 @@ class Simulation {
   int n_free_ = 0, n_fixed_ = 0;
   double time_ = 0.0;
   double last_h_ = 0.0;  // sub-step that the stored impulses belong to [s]
+  bool places_checked_ = false;  // by check_places(), since grains or walls were last added or moved from outside
 
   // Scratch of a sub-step; contacts sit in the slots of their block's pairs.
   int threads_ = 1;
@@ -161,6 +169,7 @@ class Simulation {
     int steps = 0;
   } pace_;
   double mean_radius_ = 0.0, max_radius_ = 0.0, acceleration_ = 0.0;
+  double wall_mass_ = 0.0;  // of load-driven walls whose mass nobody gave: a tenth of the grains' [kg]
   bool friction_ = false, restitution_ = false, tangential_restitution_ = false;
   std::vector<double> gap_;
   std::vector<Contact<dim>> contacts_;

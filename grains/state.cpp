@@ -90,7 +90,7 @@ void Neighbours<dim>::visit_state(Archive&& a) {
 template <int dim>
 template <class Archive>
 void Simulation<dim>::visit_state(Archive&& a) {
-  a(settings), a(gravity), a(box_), a(time_), a(last_h_), a(n_free_), a(n_fixed_), a(walls_);
+  a(settings), a(gravity), a(box_), a(time_), a(last_h_), a(n_free_), a(n_fixed_), a(walls_), a(places_checked_);
   a(grains_.x), a(grains_.body), a(grains_.r), a(grains_.id), a(grains_.wall), a(grains_.material), a(grains_.force);
   a(grains_.inertia), a(materials_.names_), a(materials_.pairs_);
   neighbours_.visit_state(a);

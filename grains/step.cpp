@@ -32,8 +32,9 @@ constexpr double repaired = 0.5;  // of the excess, in a sub-step
 
 template <int dim>
 StepReport<dim> Simulation<dim>::step(double dt) {
-  if (!(dt > 0) || !std::isfinite(dt)) fail("step: dt must be > 0 s, got {}", dt);
-  prepare();
+  check(dt);
+  free_walls();
+  threads_ = choose_threads();
   const auto start = std::chrono::steady_clock::now();
   StepReport<dim> report;
   report.dt = dt;
@@ -116,13 +117,18 @@ int Simulation<dim>::choose_threads() {
 
 // Checks of the scene that adding things one by one cannot make, and what depends on the scene but not on the sub-step.
 template <int dim>
-void Simulation<dim>::prepare() {
+void Simulation<dim>::check(double dt) {
+  check_positive(dt, "step: dt", "s");
+  quicksand::check(settings, "step");
+  if (!is_finite(gravity.norm())) fail("step: gravity must be finite, got ({}) m/s^2", fmt::join(gravity, ", "));
   const int n = grains_.size();
-  double mass = 0.0, r_sum = 0.0;
+  double mass = 0.0, r_sum = 0.0, r_min = std::numeric_limits<double>::infinity(), v2_max = 0.0;
   std::vector<char> used(materials_.names().size(), 0), grain(used.size(), 0);
   acceleration_ = 0.0;
   for (int k = 0; k < n; ++k) {
     r_sum += grains_.r[k];
+    r_min = std::min(r_min, grains_.r[k]);
+    v2_max = std::max(v2_max, grains_.body[k].v.squaredNorm());
     if (grains_.body[k].inv_m > 0) mass += 1.0 / grains_.body[k].inv_m;
     if (!grains_.force.empty()) acceleration_ = std::max(acceleration_, grains_.force[k].norm() * grains_.body[k].inv_m);
     used[grains_.material[k]] = 1;
@@ -132,14 +138,15 @@ void Simulation<dim>::prepare() {
   mean_radius_ = n > 0 ? r_sum / n : 0.0;
   max_radius_ = n > 0 ? *std::max_element(grains_.r.begin(), grains_.r.end()) : 0.0;
   double wall_acceleration = 0.0;
-  for (Wall<dim>& wall : walls_) {
+  wall_mass_ = 0.1 * mass;
+  for (const Wall<dim>& wall : walls_) {
     used[wall.material] = 1;
+    v2_max = std::max(v2_max, wall.v.squaredNorm());
     for (int k = 0; k < dim; ++k) {
       if (!wall.loaded[k]) continue;
-      if (wall.mass == 0.0 && mass > 0.0) wall.mass = 0.1 * mass;
-      if (wall.mass == 0.0) fail("step: a load-driven wall needs a mass where there are no grains");
-      wall.inv_m[k] = 1.0 / wall.mass;
-      wall_acceleration = std::max(wall_acceleration, std::abs(wall.load[k]) * wall.inv_m[k]);
+      const double m = wall.mass > 0 ? wall.mass : wall_mass_;
+      if (m == 0.0) fail("step: load-driven wall {} needs a mass [kg] where there are no grains", &wall - walls_.data());
+      wall_acceleration = std::max(wall_acceleration, std::abs(wall.load[k]) / m);
     }
   }
   acceleration_ += wall_acceleration;
@@ -154,8 +161,57 @@ void Simulation<dim>::prepare() {
       restitution_ |= pair.normal > 0 || pair.tangential > 0;
       tangential_restitution_ |= pair.tangential > 0;
     }
+  // No two come closer faster than this; a billion sub-steps is no simulation, but a slip of the pen.
+  const double speed = std::sqrt(v2_max) + dt * acceleration_;
+  if (n > 0 && dt * speed > 1e9 * settings.sub_step_motion * r_min)
+    fail("step: dt = {} s takes more than 1e9 sub-steps at speeds up to {:.4g} m/s with a smallest radius of {:.4g} m", dt, speed, r_min);
+  if (!places_checked_) check_places();
+  places_checked_ = true;
+}
+
+// Where grains and walls may not be at the start; later the solver sees to it. Only when they were put somewhere from outside.
+template <int dim>
+void Simulation<dim>::check_places() const {
+  constexpr auto plane = Wall<dim>::Shape::plane;
+  const int n = grains_.size(), n_walls = static_cast<int>(walls_.size());
+  for (int b = 0; b < n_walls; ++b)
+    for (int a = 0; a < b; ++a) {
+      const bool facing = walls_[a].shape == plane && walls_[b].shape == plane && walls_[a].normal.dot(walls_[b].normal) < -1 + 1e-12;
+      const double between = (walls_[b].point - walls_[a].point).dot(walls_[a].normal);
+      if (facing && between < 0) fail("step: walls {} and {} cross: they face each other over {:.4g} m", a, b, between);
+    }
+  for (int w = 0; w < n_walls; ++w)
+    for (int k = 0; k < n && walls_[w].shape == plane; ++k) {
+      const double distance = nearest_point(walls_[w], grains_.x[k], box_).distance;
+      if (grains_.wall[k] < 0 && distance < 0)
+        fail("step: grain {} is {:.4g} m behind wall {}, whose normal points to the side of the grains", grains_.id[k], -distance, w);
+    }
+  std::vector<Vec<dim>> x(grains_.x);
+  for (Vec<dim>& p : x) p = box_.wrap(p);
+  const CloseGrains<dim> close(x, grains_.r, box_, 1.0, 0.0);
+  auto name = [&](int k) {
+    return grains_.wall[k] < 0 ? fmt::format("grain {}", grains_.id[k]) : fmt::format("a grain fixed to wall {}", grains_.wall[k]);
+  };
+  for (int k = 0; k < n; ++k)
+    close.visit(k, [&](int i, int j, int code) {
+      if (grains_.wall[i] >= 0 && grains_.wall[j] >= 0) return;
+      const double distance = (x[j] - x[i] + periodic_shift(box_, code)).norm();
+      const double overlap = grains_.r[i] + grains_.r[j] - distance, smaller = std::min(grains_.r[i], grains_.r[j]);
+      if (grains_.id[i] > grains_.id[j]) std::swap(i, j);
+      if (overlap > smaller)
+        fail("step: {} and {} overlap by {:.4g} m, more than the smaller radius, {:.4g} m", name(i), name(j), overlap, smaller);
+    });
+}
+
+template <int dim>
+void Simulation<dim>::free_walls() {
   wall_before_.resize(walls_.size());
-  threads_ = choose_threads();
+  for (Wall<dim>& wall : walls_)
+    for (int k = 0; k < dim; ++k) {
+      if (!wall.loaded[k]) continue;
+      if (wall.mass == 0.0) wall.mass = wall_mass_;
+      wall.inv_m[k] = 1.0 / wall.mass;
+    }
 }
 
 // Gaps of all listed pairs, and how fast they move relative to each other.

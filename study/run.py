@@ -1,6 +1,7 @@
 """The stepping loop of a study: one sample per time step, progress, frames and checkpoints, an end by Ctrl-C that loses nothing."""
 
 import json
+import math
 import signal
 import sys
 import threading
@@ -34,9 +35,16 @@ class Run:
     sim : quicksand.grains.Simulation
     dt, t_end : float
         Time step and end [s]; the number of steps is t_end / dt, rounded.
+
+    Raises
+    ------
+    ValueError
+        When dt <= 0, t_end < dt, or either is not finite.
     """
 
     def __init__(self, sim, dt, t_end):
+        if not (0 < dt <= t_end < math.inf):
+            raise ValueError(f"Run: dt must be > 0 s and t_end at least dt, got dt = {dt:g} s and t_end = {t_end:g} s")
         self.sim, self.dt = sim, dt
         self.steps = round(t_end / dt)
         self.samples = 0  # steps made so far

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .errors import check_number, check_whole
+
 
 @dataclass(frozen=True)
 class Profile:
@@ -33,9 +35,17 @@ class Profiles:
     bins : int
     cross_section : float
         Extent of the cell across `axis` [m in 2D, m^2 in 3D].
+
+    Raises
+    ------
+    ValueError
+        When axis is not 0, 1 or 2, bins not in 1 to 1e6, cross_section not > 0.
     """
 
     def __init__(self, axis, bins, cross_section):
+        check_whole("Profiles: axis", axis, 0, 2)
+        check_whole("Profiles: bins", bins, 1, 1_000_000)
+        check_number("Profiles: cross_section", cross_section, "m (3D: m^2)", above=0)
         self.axis, self.bins, self.cross_section = axis, bins, cross_section
         self.samples = []  # (time, height, profile)
 
@@ -59,6 +69,8 @@ class Profiles:
 
     def mean(self, start):
         """Average over the samples with time >= start [s], a `Profile`; None without samples, or where start is None."""
+        if start is not None:
+            check_number("Profiles.mean: start", start, "s")
         chosen = [(height, profile) for time, height, profile in self.samples if start is not None and time >= start]
         if not chosen:
             return None

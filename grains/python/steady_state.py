@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .errors import finite_series
+
 WINDOW = 100  # samples: of the final mean, and of the sliding window
 SIGN_CHANGES = 8  # four complete oscillations
 DEAD_BAND = 1e-4  # of the final height: smaller excursions change no sign
@@ -47,17 +49,19 @@ def detect_steady_state(time, height):
     Raises
     ------
     ValueError
-        When the shapes differ or a value is not finite.
+        When the shapes differ, a value is not finite, or times do not increase from >= 0.
 
     Notes
     -----
     Thesis on dense granular rheology with MigFlow, section 2.4 (plane Couette flow under imposed pressure).
     """
-    time, height = np.asarray(time, float), np.asarray(height, float)
-    if time.ndim != 1 or time.shape != height.shape:
+    time, height = finite_series("detect_steady_state: time", time, "s"), finite_series("detect_steady_state: height", height, "m")
+    if time.shape != height.shape:
         raise ValueError(f"detect_steady_state: time and height must both have shape (n,), got {time.shape} and {height.shape}")
-    if not (np.isfinite(time).all() and np.isfinite(height).all()):
-        raise ValueError("detect_steady_state: time and height must be finite")
+    back = np.flatnonzero(np.diff(time, prepend=-np.inf) <= 0)
+    if time.size and (time[0] < 0 or back.size):
+        bad = back[0] if back.size else 0
+        raise ValueError(f"detect_steady_state: time must increase from >= 0 s, got {time[bad]:g} s (sample {bad})")
     if time.size < WINDOW:
         return SteadyState(None, None, None)
 
@@ -116,8 +120,13 @@ def block_average(samples):
     -------
     BlockAverage or None
         None without samples. Its error is None when the series is shorter than 8 correlation lengths, or 12 samples.
+
+    Raises
+    ------
+    ValueError
+        When the shape is not (n,) or a sample is not finite.
     """
-    samples = np.asarray(samples, float)
+    samples = finite_series("block_average: samples", samples, "")
     n = samples.size
     if n == 0:
         return None
@@ -170,8 +179,16 @@ def ratio_error(numerator, denominator):
     -------
     float or None
         As the error of `block_average`.
+
+    Raises
+    ------
+    ValueError
+        When the shapes differ or a value is not finite.
     """
-    numerator, denominator = np.asarray(numerator, float), np.asarray(denominator, float)
+    numerator, denominator = (finite_series(f"ratio_error: {name}", series, "")
+                              for name, series in (("numerator", numerator), ("denominator", denominator)))
+    if numerator.shape != denominator.shape:
+        raise ValueError(f"ratio_error: numerator and denominator must have one shape, got {numerator.shape} and {denominator.shape}")
     if numerator.size == 0 or denominator.mean() == 0.0:
         return None
     ratio = numerator.mean() / denominator.mean()

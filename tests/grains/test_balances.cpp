@@ -91,7 +91,7 @@ TYPED_TEST(Balances, kinetic_energy_changes_by_work_less_dissipation) {
   sim.gravity = in_plane<dim>(1, -g);
   sim.drive(floor, 0, 0.5);
   const double load = -20 * 64 * mass<dim>(1e-3) * g;
-  sim.load(lid, 1, load, {});
+  sim.set_load(lid, 1, load, {});
   auto kinetic = [&] {
     double sum = 0.5 * sim.walls()[lid].mass * squared(sim.walls()[lid].v[1]);
     for (const Body<dim>& b : sim.grains().body)

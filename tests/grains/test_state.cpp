@@ -20,7 +20,7 @@ Simulation<dim> busy_scene() {
   sim.set_restitution("grain", "grain", 0.7, 0.2);
   sim.add_plane(in_plane<dim>(0, 0), in_plane<dim>(0, 1), "wall");
   const int lid = sim.add_plane(in_plane<dim>(0, 0.0125), in_plane<dim>(0, -1), "wall");
-  sim.load(lid, 1, -0.01, 1.0);
+  sim.set_load(lid, 1, -0.01, 1.0);
   sim.drive(lid, 0, 0.1);
   std::vector<Vec<dim>> force(sim.count(), in_plane<dim>(1e-3, 0));
   sim.set_force(force);

@@ -15,7 +15,7 @@ TYPED_TEST(Walls, a_wall_with_nothing_in_its_way_follows_its_load_and_its_drive_
   auto sim = scene<dim>(0.3);
   const int wall = sim.add_plane(Vec<dim>::Zero(), in_plane<dim>(0, 1), "wall");
   sim.drive(wall, 0, 0.2);
-  sim.load(wall, 1, -3.0, 1.5);
+  sim.set_load(wall, 1, -3.0, 1.5);
   const int n = 100;
   const double dt = 1e-3;
   for (int k = 0; k < n; ++k) sim.step(dt);
@@ -34,7 +34,7 @@ TYPED_TEST(Walls, a_loaded_wall_weighs_a_tenth_of_the_grains_unless_told) {
   constexpr int dim = TypeParam::value;
   auto sim = scene<dim>(0.3);
   const int wall = sim.add_plane(in_plane<dim>(0, -10 * r), in_plane<dim>(0, 1), "wall");
-  sim.load(wall, 1, -1.0, {});
+  sim.set_load(wall, 1, -1.0, {});
   EXPECT_THROW(sim.step(1e-3), std::invalid_argument);  // a tenth of nothing
   add<dim>(sim, in_plane<dim>(0, 0), r);
   add<dim>(sim, in_plane<dim>(5 * r, 0), 2 * r);
@@ -58,7 +58,7 @@ struct Cell {
     sim.add_plane(in_plane<dim>(0, half), in_plane<dim>(0, -1), "wall");
     sim.drive(0, 0, -slide);
     sim.drive(1, 0, slide);
-    sim.load(1, 1, -load, {});
+    sim.set_load(1, 1, -load, {});
     sim.settings.solve.tolerance = 1e-4;
   }
 
@@ -83,7 +83,7 @@ TYPED_TEST(Walls, grains_pressed_by_a_load_come_to_rest_with_that_force_on_both_
   StepReport<dim> report;
   for (int k = 0; k < 2000; ++k) cell.sim.step(1e-4);
   cell.sim.set_velocity(std::vector<Vec<dim>>(cell.sim.count(), Vec<dim>::Zero()));
-  cell.sim.set_omega(std::vector<Spin<dim>>(cell.sim.count(), zero<Spin<dim>>()));
+  cell.sim.set_spin(std::vector<Spin<dim>>(cell.sim.count(), zero<Spin<dim>>()));
   for (int k = 0; k < 20; ++k) report = cell.sim.step(1e-4);
   EXPECT_LT(std::abs(cell.sim.walls()[1].v[1]), 1e-6);
   EXPECT_NEAR(cell.sim.walls()[1].force[1], cell.load, 1e-3 * cell.load);
@@ -125,7 +125,7 @@ TYPED_TEST(Walls, grains_fixed_to_a_wall_move_with_it_and_carry_its_load) {
   sim.gravity = in_plane<dim>(0, -g);
   sim.drive(wall, 0, 0.1);
   const double m = 2 * mass<dim>(r), h = 1e-4;
-  sim.load(wall, 1, (m + mass<dim>(r)) * g, m);  // gravity does not act on walls: the load bears the ball and lifts the wall
+  sim.set_load(wall, 1, (m + mass<dim>(r)) * g, m);  // gravity does not act on walls: the load bears the ball and lifts the wall
   add<dim>(sim, in_plane<dim>(0, 1.6 * r), r, in_plane<dim>(0.1, 0));  // sqrt(2^2 - 1.2^2) = 1.6: touching
   for (int k = 0; k < 500; ++k) sim.step(h);
   const double a = m * g / (m + mass<dim>(r));  // of wall and ball together: load - weight = m g
