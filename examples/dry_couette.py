@@ -133,6 +133,7 @@ class Scene:
             y = side * (height / 2 + self.rough)
             self.walls.append(self.sim.add_plane(point=(0.0, y), normal=(0.0, -side), material="wall", **across))
         self.fixed = self.attach_rows() if flags.rough_walls else None
+        self.sim.check(flags.dt)
 
     def attach_rows(self):
         columns = int(self.width / (2 * RADIUS) + 1e-9)

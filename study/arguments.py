@@ -86,6 +86,8 @@ class Parser(CommandLine):
             flags = super().parse_args(args, namespace)
         if flags.t_end < flags.dt:
             self.error(f"argument --t-end: must be at least one time step (--dt {flags.dt:g} s), got {flags.t_end:g} s")
+        if flags.t_end > 1e9 * flags.dt:
+            self.error(f"argument --t-end: must be at most 1e9 time steps (--dt {flags.dt:g} s), got {flags.t_end:g} s")
         with self.user_errors():
             flags.out.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=flags.out):

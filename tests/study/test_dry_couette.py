@@ -1,5 +1,6 @@
 """examples/dry_couette.py, run as a user runs it, in cells of a few hundred discs."""
 
+import importlib.util
 import json
 import os
 import subprocess
@@ -135,19 +136,70 @@ runpy.run_path({str(EXAMPLE)!r}, run_name="__main__")
 
 @pytest.mark.parametrize("args, rule", [
     (["--rate", "0"], "--rate: must be > 0 1/s, got 0"),
-    (["--pressure", "-5"], "--pressure: must be > 0 Pa, got -5"),
-    (["--size-ratio", "0.9"], "--size-ratio: must be >= 1, got 0.9"),
-    (["--friction", "-0.1"], "--friction: must be >= 0"),
-    (["--threads", "none"], "--threads: must be a whole number, got 'none'"),
-    (["--width", "0.001"], "no grain of radius 0.001 m fits"),
     (["--width", "0.006"], "four diameters"),
-    (["--fixed-height", "--size-ratio", "9"], "more than fits"),
     (["--angle", "3"], "unrecognized arguments"),
 ])
 def test_a_wrong_flag_ends_with_one_line_and_status_2(tmp_path, args, rule):
     done = run("--quick", "--out", tmp_path, *args)
     assert done.returncode == 2 and rule in done.stderr
     assert done.stderr.count("\n") == 1 and done.stdout == ""
+
+
+@pytest.fixture
+def message(tmp_path, monkeypatch, capfd):
+    """main() in this process, with flags that it must refuse before the first step: what it writes to stderr."""
+    spec = importlib.util.spec_from_file_location("dry_couette", EXAMPLE)
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    monkeypatch.setattr(example, "simulate", lambda *_: pytest.fail("it runs"))
+
+    def main(*args):
+        monkeypatch.setattr(sys, "argv", [str(EXAMPLE), "--quick", "--out", str(tmp_path), *args])
+        with pytest.raises(SystemExit) as end:
+            example.main()
+        out, err = capfd.readouterr()
+        assert end.value.code == 2 and out == "" and err.count("\n") == 1 and err.startswith("dry_couette.py: "), (args, err)
+        return err
+
+    return main
+
+
+@pytest.mark.parametrize("args, rule", [
+    (["--pressure", "-5"], "--pressure: must be > 0 Pa, got -5"),
+    (["--size-ratio", "0.9"], "--size-ratio: must be >= 1, got 0.9"),
+    (["--friction", "-0.1"], "--friction: must be >= 0"),
+    (["--friction", "1e40"], "set_friction: friction must be >= 0 and finite, got 1e+40"),
+    (["--threads", "none"], "--threads: must be a whole number, got 'none'"),
+    (["--threads", "0"], "--threads: must be >= 1, got 0"),
+    (["--threads", "5000"], "Simulation: threads must be 1 to 1024, got 5000"),
+    (["--tolerance", "2"], "Simulation: tolerance must be in (0, 1], got 2"),
+    (["--width", "0.001"], "no grain of radius 0.001 m fits"),
+    (["--width", "1e9"], "hexagonal_lattice: spacing 0.0021 m gives a cell of 1e+09 m x 0.03 m more than 1e+08 sites"),
+    (["--height", "1e300"], "more than 1e+08 sites"),
+    (["--fixed-height", "--size-ratio", "9"], "more than fits"),
+    (["--rate", "1e20"], "step: dt = 0.001 s takes more than 1e9 sub-steps"),
+    (["--rate", "1e300"], "add: velocity [m/s] must be finite"),
+    (["--pressure", "1e25"], "step: dt = 0.001 s takes more than 1e9 sub-steps"),
+    (["--pressure", "1e300"], "add_plane: load must be finite"),
+    (["--dt", "1e-300", "--t-end", "1e-299"], "step: dt must be between 1e-30 and 1e30 s, got 1e-300"),
+    (["--dt", "1e40", "--t-end", "1e40"], "step: dt must be between 1e-30 and 1e30 s, got 1e+40"),
+    (["--t-end", "1e300"], "--t-end: must be at most 1e9 time steps"),
+    (["--t-end", "0.0005"], "--t-end: must be at least one time step"),
+])
+def test_what_is_wrong_is_said_with_the_value(message, args, rule):
+    assert rule in message(*args)
+
+
+def test_no_nonsense_after_a_flag_is_taken_for_a_value(message):
+    numbers = ("--rate --pressure --size-ratio --height --width --friction --wall-friction --dt --t-end --tolerance --threads "
+               "--seed").split()
+    for flag in numbers:
+        for nonsense in ("nan", "-nan", "inf", "-inf", "-1", "1e400", "abc", "", " ", "0x10", "1,5", "--", "1 2", "\x00", "１．５ｍ"):
+            assert flag in message(flag, nonsense) or nonsense == "--"
+        message(flag)  # nothing at all
+    for flag in FLAGS:
+        if flag not in numbers and flag != "--out":
+            message(flag + "=1")
 
 
 def test_help_explains_every_flag_and_every_result():
