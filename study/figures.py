@@ -133,7 +133,8 @@ def plot_flow_curves(path, curves, label):
     for axis, name in zip(axes, (r"$\mu$ [-]", r"$\phi$ [-]")):
         axis.set(xscale="log", xlabel=label, ylabel=name)
     axes[0].legend()
-    axes[0].set_title("filled: flowing, open: not; lines: fits, dashed: the thesis's", fontsize=9, loc="left")
+    published = "; dashed: the thesis's" if any(curve["thesis"] for curve in curves) else ""
+    axes[0].set_title(f"filled: flowing, open: not; lines: fits{published}", fontsize=9, loc="left")
     figure.savefig(path)
 
 

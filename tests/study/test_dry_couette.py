@@ -192,7 +192,7 @@ def test_what_is_wrong_is_said_with_the_value(message, args, rule):
 
 def test_no_nonsense_after_a_flag_is_taken_for_a_value(message):
     numbers = ("--rate --pressure --size-ratio --height --width --friction --wall-friction --dt --t-end --tolerance --threads "
-               "--seed").split()
+               "--seed --frame-every --checkpoint-every").split()
     for flag in numbers:
         for nonsense in ("nan", "-nan", "inf", "-inf", "-1", "1e400", "abc", "", " ", "0x10", "1,5", "--", "1 2", "\x00", "１．５ｍ"):
             assert flag in message(flag, nonsense) or nonsense == "--"
