@@ -128,7 +128,7 @@ class Sweeper {
 
   explicit Sweeper(Problem<dim>& problem) : p_(problem), s_(problem.scratch), sums_(problem.blocks.size()) {
     const std::size_t n_blocks = problem.blocks.size();
-    s_.list.resize(problem.contacts.size());
+    resize_tight(s_.list, problem.contacts.size());
     s_.listed.assign(n_blocks, 0);
     s_.units.assign(problem.count.begin(), problem.count.end());
     s_.touched.assign(problem.bodies.size(), -1);
@@ -200,13 +200,13 @@ class Sweeper {
 
   void pack() {
     const std::size_t n_blocks = p_.blocks.size();
-    s_.slots.resize(p_.contacts.size());
+    resize_tight(s_.slots, p_.contacts.size());
     s_.first.resize(n_blocks);
 #pragma omp parallel num_threads(p_.threads)
     each_block([&](int b) { fill_slots(b); });
     int total = 0;
     for (std::size_t b = 0; b < n_blocks; ++b) s_.first[b] = total, total += s_.units[b];
-    s_.packs.resize(total);
+    resize_tight(s_.packs, total);
     if (law == Law::coulomb_restitution) s_.bias_t.assign(total, PackBias{});
 #pragma omp parallel num_threads(p_.threads)
     each_block([&](int b) { fill_packs(b); });

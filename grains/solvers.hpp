@@ -11,6 +11,13 @@
 
 namespace quicksand {
 
+// Doubling, as vectors do when they grow, would cost some hundred bytes per grain.
+template <class Vector>
+void resize_tight(Vector& values, std::size_t n) {
+  if (n > values.capacity()) values.reserve(n + n / 8);
+  values.resize(n);
+}
+
 // What solvers keep in memory from one problem to the next.
 struct Scratch {
   std::vector<Pack> packs;                // 2D: the contacts, block by block

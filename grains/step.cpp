@@ -318,8 +318,8 @@ void Simulation<dim>::accelerate(double h) {
 template <int dim>
 void Simulation<dim>::find_contacts(double h, double alert, double wall_alert) {
   const int n = static_cast<int>(neighbours_.pairs.size()), n_blocks = static_cast<int>(neighbours_.blocks.size());
-  contacts_.resize(n);
-  pair_of_.resize(n);
+  resize_tight(contacts_, n);
+  resize_tight(pair_of_, n);
   count_.resize(n_blocks);
   const double scale = last_h_ > 0 ? h / last_h_ : 0.0;
   last_h_ = h;
