@@ -215,16 +215,14 @@ class Sweeper {
   // Consecutive contacts that share no grain make a pack.
   void fill_slots(int b) {
     const int begin = p_.blocks[b].begin;
-    std::array<int, 4>* pack = s_.slots.data() + begin - 1;
-    int lane = 0;
+    int pack = begin - 1, lane = 0;  // the pack being filled, by its slot
     for (int k = begin; k < begin + p_.count[b]; ++k) {
-      int &at_i = s_.touched[p_.contacts[k].i], &at_j = s_.touched[p_.contacts[k].j];  // slot of the pack they are in
-      const int current = static_cast<int>(pack - s_.slots.data());
-      if (lane == 0 || at_i == current || at_j == current) *++pack = {-1, -1, -1, -1}, lane = 4;
-      (*pack)[--lane] = k;
-      at_i = at_j = static_cast<int>(pack - s_.slots.data());
+      int &at_i = s_.touched[p_.contacts[k].i], &at_j = s_.touched[p_.contacts[k].j];  // pack they are in
+      if (lane == 0 || at_i == pack || at_j == pack) s_.slots[++pack] = {-1, -1, -1, -1}, lane = 4;
+      s_.slots[pack][--lane] = k;
+      at_i = at_j = pack;
     }
-    s_.units[b] = static_cast<int>(pack + 1 - s_.slots.data()) - begin;
+    s_.units[b] = pack + 1 - begin;
   }
 
   void fill_packs(int b) {
