@@ -39,14 +39,6 @@ class Scene:
         sim.set_force(np.full((3, dim), 1e-4))
         sim.step(1e-3)
 
-    def state(self):
-        """All that can be read of it, to be compared before and after."""
-        sim = self.sim
-        properties = [name for name in dir(type(sim)) if isinstance(getattr(type(sim), name), property)]
-        walls = [getattr(wall, name) for wall in (self.floor, self.lid) for name in ("position", "velocity", "force", "load", "mass")]
-        return [np.array(value).tolist() for value in
-                [*(getattr(sim, name) for name in properties), *walls, *sim.contacts().values()]]
-
 
 def overlapping(scene):
     scene.sim.position = [vector(scene.dim, x, R) for x in (0.0, 0.9 * R, 0.03)]
@@ -189,11 +181,11 @@ STARTS = [
 def test_a_broken_rule_is_told_with_function_value_and_unit_and_changes_nothing(dim, prepare, call, words):
     scene = Scene(dim)
     prepare(scene)
-    before = scene.state()
+    before = scene.sim.state().tobytes()
     with pytest.raises(ValueError) as told:
         call(scene)
     assert words in str(told.value)
-    assert scene.state() == before
+    assert scene.sim.state().tobytes() == before
     with pytest.raises(ValueError, match="known: (grain, wall|grain, wall, glass)$"):  # no material came in
         scene.sim.add(X[dim], R, material="none of them")
     assert scene.sim.add_plane(vector(dim, 0, -0.01), vector(dim, 0, 1)).number == 2 + (prepare is a_second_lid_below_the_floor)
@@ -390,13 +382,13 @@ def fuzz(count, seed):
         values[spoiled_one] = arguments[spoiled_one][1].poison(values[spoiled_one], rng)
         shown = f"case {case}: {scene.dim}D {name}({spoiled_one}={values[spoiled_one]!r})"
         print(shown, file=sys.stderr, flush=True)  # the last one is what crashed
-        before = scene.state()
+        before = scene.sim.state().tobytes()
         try:
             call(**values)
             wrong = "accepted"
         except TOLD:
             refused += 1
-            wrong = "" if scene.state() == before else "changed the scene"
+            wrong = "" if scene.sim.state().tobytes() == before else "changed the scene"
         except Exception as error:
             wrong = f"{type(error).__name__}: {error}"
         if wrong:
