@@ -163,6 +163,10 @@ def tables(runs, results):
             row += [f"{np.mean([r[name] for r in seeds]):.4g}" + (f" +- {error:.2g}" if error else "") if seeds else "-", thesis.get(name, "-")]
         lines.append("| " + " | ".join(row) + " |")
 
+    def mean(seeds, name):
+        known = [r[name] for r in seeds if r[name] is not None]
+        return f"{np.mean(known):.3g}" if known else "-"
+
     def value(name, k):
         return "-" if results[name][k] is None else f"{results[name][k]:.3f} +- {results[name + '_error'][k]:.3f}"
 
@@ -176,12 +180,9 @@ def tables(runs, results):
     lines += ["", "All runs, means over seeds.", "", "| lambda | rate [1/s] | I | state | mu | phi | bulk rate [1/s] | I, bulk | psi6 |", "|---" * 9 + "|"]
     for ratio, by_rate in runs.items():
         for rate, seeds in by_rate.items():
-            cells = [", ".join(sorted({r["state"] for r in seeds}))]
-            for name in ("mu", "phi", "shear_rate_bulk", "inertial_number_bulk", "psi6"):
-                known = [r[name] for r in seeds if r[name] is not None]
-                cells.append(f"{np.mean(known):.3g}" if known else "-")
-            inertial = [r["inertial_number"] for r in seeds if r["inertial_number"] is not None]
-            lines.append(f"| {ratio:g} | {rate:g} | {np.mean(inertial):.3g} | " .replace("nan", "-") + " | ".join(cells) + " |")
+            state = ", ".join(sorted({r["state"] for r in seeds}))
+            cells = [mean(seeds, name) for name in ("mu", "phi", "shear_rate_bulk", "inertial_number_bulk", "psi6")]
+            lines.append(" | ".join([f"| {ratio:g}", f"{rate:g}", mean(seeds, "inertial_number"), state, *cells]) + " |")
     return "\n".join(lines) + "\n"
 
 
