@@ -78,7 +78,7 @@ Real natural_map(const Impulse<dim, Real>& p, Real w_n, const typename Impulse<d
   const Real norm_t = length(z_t);
   const Real on_cone = positive<Real>((z_n + friction * norm_t) / (1.0 + friction * friction));
   const auto inside = norm_t <= friction * z_n;  // of K; r_n = 0 where z is in its polar cone
-  const Real r_n = inside ? z_n : on_cone;
+  const Real r_n = inside ? positive<Real>(z_n) : on_cone;  // without friction K is a half-line: norm_t = 0 does not say z_n >= 0
   const Real shrunk = inside ? Real{} + 1.0 : (norm_t > 0.0 ? friction * on_cone / norm_t : Real{});
   return (p.n - r_n) * (p.n - r_n) + squared(T(p.t - shrunk * z_t));
 }

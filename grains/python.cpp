@@ -106,16 +106,78 @@ WallHandle<dim> add_driven(const py::object& self, const char* where, const PerA
   return {self, &simulation, number};
 }
 
+constexpr std::array solver_names{"auto", "nlgs", "active_set", "newton"};  // in the order of Solver
+
 Solver solver_named(const std::string& name) {
-  if (name == "nlgs") return Solver::nlgs;
-  if (name == "active_set") return Solver::active_set;
-  fail("Simulation: solver must be 'active_set' or 'nlgs', got '{}'", name);
+  for (std::size_t k = 0; k < solver_names.size(); ++k)
+    if (name == solver_names[k]) return static_cast<Solver>(k);
+  fail("Simulation: solver must be one of '{}', got '{}'", fmt::join(solver_names, "', '"), name);
 }
 
 SubSteps sub_steps_named(const std::string& name) {
   if (name == "relative") return SubSteps::relative;
   if (name == "absolute") return SubSteps::absolute;
   fail("Simulation: sub_step_rule must be 'relative' or 'absolute', got '{}'", name);
+}
+
+template <int dim>
+py::dict to_python(const DelassusProblem<dim>& problem, const Eigen::VectorXd& r) {
+  std::vector<int> row_start{0}, column;
+  std::vector<double> value;
+  for (int c = 0; c < problem.contacts(); ++c)
+    for (int a = 0; a < dim; ++a) {
+      for (int k = problem.row_start[c]; k < problem.row_start[c + 1]; ++k)
+        for (int b = 0; b < dim; ++b) column.push_back(dim * problem.column[k] + b), value.push_back(problem.blocks[k](a, b));
+      row_start.push_back(static_cast<int>(column.size()));
+    }
+  return py::dict("row_start"_a = py::array_t<int>(row_start.size(), row_start.data()), "column"_a = py::array_t<int>(column.size(), column.data()),
+                  "value"_a = to_numpy(std::move(value)), "q"_a = problem.q, "friction"_a = to_numpy(std::vector<double>(problem.friction)),
+                  "r"_a = r, "u"_a = contact_velocity(problem, r));
+}
+
+using Indices = py::array_t<int, py::array::c_style>;
+
+std::span<const int> as_span(const Indices& a) { return {a.data(), static_cast<std::size_t>(a.size())}; }
+
+template <int dim>
+std::pair<DelassusProblem<dim>, Eigen::VectorXd> from_python(const Indices& row_start, const Indices& column, const Array& value, const Array& q,
+                                                             const Array& friction, const std::optional<Array>& start, const char* where) {
+  DelassusProblem<dim> problem = delassus_problem<dim>(as_span(row_start), as_span(column), as_span<double>(value, where, "value"),
+                                                       as_span<double>(q, where, "q"), as_span<double>(friction, where, "friction"));
+  Eigen::VectorXd r = Eigen::VectorXd::Zero(problem.q.size());
+  if (start) {
+    const auto from = as_span<double>(*start, where, "start");
+    if (static_cast<Eigen::Index>(from.size()) != r.size()) fail("{}: start must have {} entries, got {}", where, r.size(), from.size());
+    for (double x : from)
+      if (!is_finite(x)) fail("{}: start must be finite, got {}", where, x);
+    r = Eigen::Map<const Eigen::VectorXd>(from.data(), r.size());
+  }
+  return {std::move(problem), std::move(r)};
+}
+
+template <int dim>
+py::dict solve_contact_problem(const Indices& row_start, const Indices& column, const Array& value, const Array& q, const Array& friction,
+                               const std::string& solver, double tolerance, int max_iterations, const std::optional<Array>& start) {
+  constexpr const char* where = "solve_contact_problem";
+  check_positive(tolerance, fmt::format("{}: tolerance", where), "");
+  if (max_iterations < 1) fail("{}: max_iterations must be >= 1, got {}", where, max_iterations);
+  auto [problem, r] = from_python<dim>(row_start, column, value, q, friction, start, where);
+  DelassusSettings settings;
+  settings.tolerance = tolerance, settings.max_iterations = max_iterations;
+  using Solve = DelassusReport (*)(const DelassusProblem<dim>&, Eigen::VectorXd&, const DelassusSettings&);
+  Solve solve = nullptr;
+  if (solver == "auto") solve = solve_auto<dim>;
+  if (solver == "nlgs") solve = solve_nlgs<dim>;
+  if (solver == "newton") solve = solve_newton<dim>;
+  if (!solve) fail("{}: solver must be 'auto', 'nlgs' or 'newton', got '{}'", where, solver);
+  DelassusReport report;
+  {
+    py::gil_scoped_release release;
+    report = solve(problem, r, settings);
+  }
+  return py::dict("r"_a = r, "u"_a = contact_velocity(problem, r), "solver"_a = report.solver, "iterations"_a = report.iterations,
+                  "error"_a = report.error, "converged"_a = report.converged, "error_history"_a = report.error_history,
+                  "iteration_history"_a = report.iteration_history);
 }
 
 template <int dim>
@@ -234,6 +296,21 @@ void bind(py::module_& m, const char* suffix) {
            },
            "Load-bearing contacts of the last sub-step: grain_i, grain_j (ids; wall w is -1 - w), normal (n, dim) from i to j,\n"
            "point (n, dim) [m], force_normal (n,) and force_tangential (n, dim) on j [N] (2D: N/m).")
+      .def("_contact_problem",
+           [](Sim& s) {
+             const auto [problem, r] = s.contact_problem();
+             return to_python(problem, r);
+           },
+           "See contact_problem().")
+      .def("global_error",
+           [](Sim& s) {
+             const auto [problem, r] = s.contact_problem();
+             py::gil_scoped_release release;
+             return global_error(problem, r);
+           },
+           "Estimate of how far the last sub-step's solution is from the exact one, relative, in the energy norm: what its velocities\n"
+           "still miss over all that contacts change in them [-]; inf where there was none. The residual is local and hides errors\n"
+           "that vary smoothly over many layers. Costs a factorisation: for a look, not for every step.")
       .def("state",
            [](const Sim& s) {
              const std::vector<char> bytes = s.state();
@@ -273,8 +350,8 @@ void bind(py::module_& m, const char* suffix) {
       .def("set_force", [](Sim& s, const std::optional<Array>& f) {
              s.set_force(as_span<Vec<dim>>(f, "set_force", "force", s.count()));
            }, "force"_a, "External force on each grain from now on, (n, dim) [N] (2D: N/m); None: none.")
-      .def_property("solver", [](const Sim& s) { return s.settings.solver == Solver::nlgs ? "nlgs" : "active_set"; },
-                    [](Sim& s, const std::string& v) { s.settings.solver = solver_named(v); }, "'active_set' or 'nlgs'")
+      .def_property("solver", [](const Sim& s) { return solver_names[static_cast<int>(s.settings.solver)]; },
+                    [](Sim& s, const std::string& v) { s.settings.solver = solver_named(v); }, "'auto': 'active_set', then 'newton' and 'nlgs' should it run out of sweeps")
       .def_property("sub_step_rule", [](const Sim& s) { return s.settings.sub_steps == SubSteps::relative ? "relative" : "absolute"; },
                     [](Sim& s, const std::string& v) { s.settings.sub_steps = sub_steps_named(v); },
                     "'relative': motion of neighbours; 'absolute': ceil(8 v_max dt/r_min), the rule of the MigFlow thesis");
@@ -294,7 +371,7 @@ void bind(py::module_& m, const char* suffix) {
   setting("tolerance", [](Settings& s) -> double& { return s.solve.tolerance; },
           "of every sub-step, on the residual [-]; no contact may be wrong by more than tolerance/20 mean diameters");
   setting("max_sweeps", [](Settings& s) -> int& { return s.solve.max_sweeps; },
-          "before the fallback, and again as many for it");
+          "before the fallback");
   setting("omega", [](Settings& s) -> double& { return s.solve.omega; },
           "over-relaxation to start from [-]");
   setting("active_sweeps", [](Settings& s) -> int& { return s.solve.active_sweeps; },
@@ -345,6 +422,29 @@ PYBIND11_MODULE(_grains, m) {
       &psi6, py::name("psi6"), py::is_method(m.attr("Simulation2D")), "low"_a, "high"_a,
       "Hexagonal order: mean over grains with low <= y <= high [m] of |mean exp(6 i theta)| over neighbours nearer than\n"
       "1.3 (r_i + r_j) [-].");
+  m.def(
+      "contact_problem_global_error",
+      [](int dim, const Indices& row_start, const Indices& column, const Array& value, const Array& q, const Array& friction, const Array& r) {
+        constexpr const char* where = "global_error";
+        if (dim != 2 && dim != 3) fail("{}: dim must be 2 or 3, got {}", where, dim);
+        auto of = [&](auto problem_and_r) {
+          py::gil_scoped_release release;
+          return global_error(problem_and_r.first, problem_and_r.second);
+        };
+        return dim == 2 ? of(from_python<2>(row_start, column, value, q, friction, r, where))
+                        : of(from_python<3>(row_start, column, value, q, friction, r, where));
+      },
+      "dim"_a, "row_start"_a, "column"_a, "value"_a, "q"_a, "friction"_a, "r"_a, "See ContactProblem.global_error.");
+  m.def(
+      "solve_contact_problem",
+      [](int dim, const Indices& row_start, const Indices& column, const Array& value, const Array& q, const Array& friction,
+         const std::string& solver, double tolerance, int max_iterations, const std::optional<Array>& start) {
+        if (dim != 2 && dim != 3) fail("solve_contact_problem: dim must be 2 or 3, got {}", dim);
+        return (dim == 2 ? solve_contact_problem<2> : solve_contact_problem<3>)(row_start, column, value, q, friction, solver, tolerance,
+                                                                               max_iterations, start);
+      },
+      "dim"_a, "row_start"_a, "column"_a, "value"_a, "q"_a, "friction"_a, "solver"_a, "tolerance"_a, "max_iterations"_a, "start"_a,
+      "See ContactProblem.solve.");
   m.def(
       "Simulation",
       [](int dim, const PerAxis& period, const std::optional<Array>& gravity, const py::kwargs& settings) {

@@ -9,7 +9,7 @@
 
 namespace quicksand {
 
-enum class Solver { nlgs, active_set };
+enum class Solver { automatic, nlgs, active_set, newton };
 
 enum class SubSteps {
   relative,  // motion of a pair relative to each other, in a sub-step, below `sub_step_motion` of the distance of their centres
@@ -17,7 +17,7 @@ enum class SubSteps {
 };
 
 struct Settings {
-  Solver solver = Solver::active_set;
+  Solver solver = Solver::automatic;
   SolverSettings solve;
   SubSteps sub_steps = SubSteps::relative;
   double sub_step_motion = 0.1;     // [-]
@@ -28,7 +28,7 @@ struct Settings {
 
 void check(const Settings& settings, const char* where);  // throws std::invalid_argument
 
-// A sub-step missed its tolerance after all sweeps and the fallback. The scene has taken the sub-step all the same.
+// A sub-step missed its tolerance after all sweeps and fallbacks. The scene has taken the sub-step all the same.
 struct NotConverged : std::runtime_error {
   using std::runtime_error::runtime_error;
 };
@@ -105,6 +105,9 @@ class Simulation {
   std::size_t memory() const;  // bytes held in arrays that grow with the number of grains
   ContactList<dim> contacts() const;
 
+  // The contact problem of the last sub-step and the impulses that were found for it [N s] (2D: N s/m); see delassus().
+  std::pair<DelassusProblem<dim>, Eigen::VectorXd> contact_problem();
+
   // State by id; for changes from outside between steps.
   template <class Get>
   auto by_id(Get&& get) const {
@@ -142,6 +145,7 @@ class Simulation {
   void repair_overlaps(double allowed);
   double sub_step_length(double left, double dt, const Motion& motion) const;
   void find_contacts(double h, double alert, double wall_alert);
+  Problem<dim> problem();
   SolveReport solve_contacts(double h);
   bool rebound();
   void accelerate(double h);

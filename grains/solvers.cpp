@@ -111,6 +111,15 @@ Change<> error(const A& a, const Body<dim>& b, const C& c, const Tangent<dim>* b
   return {change, w * (c.p.n * c.p.n + squared(c.p.t)), w * change};
 }
 
+// visit(block) for every block, by the threads of a team: those of one colour at the same time.
+template <int dim, class Visit>
+void each_block(const Problem<dim>& problem, Visit&& visit) {
+  for (std::size_t colour = 0; colour + 1 < problem.colours.size(); ++colour) {
+#pragma omp for schedule(static)
+    for (int b = problem.colours[colour]; b < problem.colours[colour + 1]; ++b) visit(b);
+  }
+}
+
 // What a pass over the contacts does. Each lists the contacts that have not settled for the next.
 enum class Pass {
   all,        // update every contact
@@ -153,7 +162,7 @@ class Sweeper {
 
   // To be called by all threads of a team; ends with a barrier after which the sums hold.
   void pass(Pass what, double omega) {
-    each_block([&](int b) { sums_[b] = block(what, b, omega); });
+    each_block(p_, [&](int b) { sums_[b] = block(what, b, omega); });
 #pragma omp single
     finish(what, omega);
   }
@@ -190,26 +199,18 @@ class Sweeper {
   long updates() const { return updates_; }
 
  private:
-  template <class Visit>
-  void each_block(Visit&& visit) {
-    for (std::size_t colour = 0; colour + 1 < p_.colours.size(); ++colour) {
-#pragma omp for schedule(static)
-      for (int b = p_.colours[colour]; b < p_.colours[colour + 1]; ++b) visit(b);
-    }
-  }
-
   void pack() {
     const std::size_t n_blocks = p_.blocks.size();
     resize_tight(s_.slots, p_.contacts.size());
     s_.first.resize(n_blocks);
 #pragma omp parallel num_threads(p_.threads)
-    each_block([&](int b) { fill_slots(b); });
+    each_block(p_, [&](int b) { fill_slots(b); });
     int total = 0;
     for (std::size_t b = 0; b < n_blocks; ++b) s_.first[b] = total, total += s_.units[b];
     resize_tight(s_.packs, total);
     if (law == Law::coulomb_restitution) s_.bias_t.assign(total, PackBias{});
 #pragma omp parallel num_threads(p_.threads)
-    each_block([&](int b) { fill_packs(b); });
+    each_block(p_, [&](int b) { fill_packs(b); });
   }
 
   // Consecutive contacts that share no grain make a pack.
@@ -335,8 +336,7 @@ SolveReport relax(Problem<dim>& problem, const SolverSettings& settings, bool ac
   double trial = settings.tolerance, trial_worst = 2 * settings.worst;  // changes below which the residual is looked at
   double before = std::numeric_limits<double>::infinity(), before_worst = before;
   int unchecked = 0;  // passes since the last look at the residual that may have been enough
-  int slow = 0, limit = settings.max_sweeps;
-  bool fallen_back = !active_set;
+  int slow = 0;
   const long contacts = std::accumulate(problem.count.begin(), problem.count.end(), 1L);
 #pragma omp parallel num_threads(problem.threads)
   while (next != Next::done) {
@@ -356,8 +356,7 @@ SolveReport relax(Problem<dim>& problem, const SolverSettings& settings, bool ac
         report.worst = sweeper.worst();
         report.converged = (report.residual <= settings.tolerance && report.worst <= settings.worst) ||
                            report.worst <= settings.rounding;  // contacts that only just touch: impulses of the size of their errors
-        const bool out_of_sweeps = sweeper.sweeps() >= limit;
-        if (report.converged || (out_of_sweeps && fallen_back)) {
+        if (report.converged || sweeper.sweeps() >= settings.max_sweeps) {
           next = Next::done;
         } else {
           auto lower = [](double trial, double seen, double wanted, double error) {
@@ -366,22 +365,21 @@ SolveReport relax(Problem<dim>& problem, const SolverSettings& settings, bool ac
           trial = lower(trial, before, settings.tolerance, report.residual);
           trial_worst = lower(trial_worst, before_worst, settings.worst, report.worst);
           unchecked = 0;
-          next = fallen_back ? Next::sweep : Next::active;
-          if (out_of_sweeps) fallen_back = true, omega = 1.0, limit += settings.max_sweeps, next = Next::sweep;
+          next = active_set ? Next::active : Next::sweep;
         }
       } else {
         const double change = sweeper.relative();
         // Over-relaxation can cycle in dense states: three sweeps in a row that gain less than a fifth halve omega - 1.
         slow = change > 0.8 * before ? slow + 1 : 0;
         // Where that does not help it was no cycle, but impulses that balance each other, as of a wedged grain, and fade slowly.
-        if (!fallen_back && slow >= (omega > 1.0 ? 3 : 10))
+        if (active_set && slow >= (omega > 1.0 ? 3 : 10))
           omega = omega == 1.0 ? strongest_omega : (omega < 1.1 ? 1.0 : 1.0 + 0.5 * (omega - 1.0)), slow = 0;
         before = change, before_worst = sweeper.worst();
         // Settled: an equal share of the tolerance in the energy norm, and well below the error allowed to one contact.
         sweeper.settle(settings.tolerance * settings.tolerance * sweeper.size() / static_cast<double>(contacts), 0.3 * settings.worst);
         const bool promising = change <= trial && before_worst <= trial_worst;
         const bool worth_a_look = change <= settings.tolerance && before_worst <= 2 * settings.worst && ++unchecked >= 5;
-        next = promising || worth_a_look || sweeper.sweeps() >= limit ? Next::check : (fallen_back ? Next::sweep : Next::active);
+        next = promising || worth_a_look || sweeper.sweeps() >= settings.max_sweeps ? Next::check : (active_set ? Next::active : Next::sweep);
       }
     }
   }
@@ -410,27 +408,194 @@ SolveReport solve_active_set(Problem<dim>& problem, const SolverSettings& settin
   return relax_by_law(problem, settings, true);
 }
 
+// Factorising W of more contacts than that takes longer than any number of sweeps that a step may make, and gigabytes.
+constexpr std::size_t newton_contacts = 100000;
+
+template <int dim>
+SolveReport solve_auto(Problem<dim>& problem, const SolverSettings& settings) {
+  SolveReport report = solve_active_set(problem, settings);
+  auto go_on = [&](const SolveReport& more) {
+    report = {report.sweeps + more.sweeps, report.updates + more.updates, more.residual, more.worst, more.converged};
+  };
+  const std::size_t contacts = std::accumulate(problem.count.begin(), problem.count.end(), problem.wall_contacts.size());
+  if (!report.converged && contacts <= newton_contacts) go_on(solve_newton(problem, settings));
+  if (!report.converged) go_on(solve_nlgs(problem, settings));
+  return report;
+}
+
 template <int dim>
 void warm_start(Problem<dim>& problem) {
   auto start = [&](auto& a, Body<dim>& b, const auto& c) {
     if (c.p.n > 0.0) push<Law::coulomb>(a, b, c.n, c.p.n, c.p.t, problem.spin_ratio);
   };
 #pragma omp parallel num_threads(problem.threads)
-  for (std::size_t colour = 0; colour + 1 < problem.colours.size(); ++colour) {
-#pragma omp for schedule(static)
-    for (int b = problem.colours[colour]; b < problem.colours[colour + 1]; ++b)
-      for (int k = problem.blocks[b].begin; k < problem.blocks[b].begin + problem.count[b]; ++k) {
-        const Contact<dim>& c = problem.contacts[k];
-        start(problem.bodies[c.i], problem.bodies[c.j], c);
-      }
-  }
+  each_block(problem, [&](int b) {
+    for (int k = problem.blocks[b].begin; k < problem.blocks[b].begin + problem.count[b]; ++k) {
+      const Contact<dim>& c = problem.contacts[k];
+      start(problem.bodies[c.i], problem.bodies[c.j], c);
+    }
+  });
   for (const WallContact<dim>& c : problem.wall_contacts) start(problem.walls[c.wall], problem.bodies[c.j], c);
+}
+
+namespace {
+
+// Calls visit(contact, bias_t) for every contact, in the order of delassus().
+template <int dim, class P, class Visit>
+void each_contact(P& problem, Visit&& visit) {
+  static const Tangent<dim> none = zero<Tangent<dim>>();
+  for (std::size_t b = 0; b < problem.blocks.size(); ++b)
+    for (int k = problem.blocks[b].begin; k < problem.blocks[b].begin + problem.count[b]; ++k)
+      visit(problem.contacts[k], problem.bias_t.empty() ? none : problem.bias_t[k]);
+  for (std::size_t k = 0; k < problem.wall_contacts.size(); ++k)
+    visit(problem.wall_contacts[k], problem.wall_bias_t.empty() ? none : problem.wall_bias_t[k]);
+}
+
+// The axes of a contact: n, then tangents t with n x t1 = t2.
+template <int dim>
+Mat<dim> axes(const Vec<dim>& n) {
+  Mat<dim> r;
+  r.col(0) = n;
+  if constexpr (dim == 2) {
+    r.col(1) = tangent_vector(n, 1.0);
+  } else {
+    int least;
+    n.cwiseAbs().minCoeff(&least);
+    r.col(1) = cross(n, Vec<3>(Vec<3>::Unit(least))).normalized();
+    r.col(2) = cross(n, Vec<3>(r.col(1)));
+  }
+  return r;
+}
+
+template <int dim>
+Vec<dim> components(const Mat<dim>& axes, double along_n, const Tangent<dim>& t) {
+  if constexpr (dim == 2)
+    return {along_n, t};
+  else
+    return {along_n, t.dot(axes.col(1)), t.dot(axes.col(2))};
+}
+
+// W of two contacts by a body they share: its translation, and its spin, on whose direction n x t the tangents act.
+template <int dim>
+Mat<dim> coupling(const Mat<dim>& a, const Mat<dim>& b, double sign, double inv_m, double spin_ratio) {
+  Mat<dim> w = (sign * inv_m) * a.transpose() * b;
+  if constexpr (dim == 2) {
+    w(1, 1) += inv_m * spin_ratio;
+  } else {
+    Eigen::Matrix<double, 3, 2> turn_a, turn_b;
+    turn_a << a.col(2), -a.col(1);
+    turn_b << b.col(2), -b.col(1);
+    w.template block<2, 2>(1, 1) += inv_m * spin_ratio * turn_a.transpose() * turn_b;
+  }
+  return w;
+}
+
+}  // namespace
+
+template <int dim>
+std::pair<DelassusProblem<dim>, Eigen::VectorXd> delassus(const Problem<dim>& problem) {
+  struct End {
+    int contact;
+    double sign;  // +1: body j of the contact
+  };
+  std::vector<std::vector<End>> of_body(problem.bodies.size()), of_wall(problem.walls.size());
+  std::vector<Mat<dim>> frame;
+  std::vector<std::array<int, 2>> ends;  // bodies; a wall: -1 - its number
+  DelassusProblem<dim> out;
+  std::vector<Vec<dim>> r, u;
+  each_contact<dim>(problem, [&](const auto& c, const Tangent<dim>& bias_t) {
+    const int k = static_cast<int>(frame.size());
+    frame.push_back(axes<dim>(c.n));
+    out.friction.push_back(c.friction);
+    r.push_back(components<dim>(frame.back(), c.p.n, c.p.t));
+    Slip<dim> slip;
+    of_body[c.j].push_back({k, 1.0});
+    if constexpr (requires { c.wall; }) {
+      slip = quicksand::slip<Law::coulomb, dim>(problem.walls[c.wall], problem.bodies[c.j], c.n);
+      if (!problem.walls[c.wall].inv_m.isZero(0.0)) of_wall[c.wall].push_back({k, -1.0});
+      ends.push_back({-1 - c.wall, c.j});
+    } else {
+      slip = quicksand::slip<Law::coulomb, dim>(problem.bodies[c.i], problem.bodies[c.j], c.n);
+      of_body[c.i].push_back({k, -1.0});
+      ends.push_back({c.i, c.j});
+    }
+    u.push_back(components<dim>(frame.back(), slip.n + c.bias, Tangent<dim>(slip.t + bias_t)));
+  });
+  const int n = static_cast<int>(frame.size());
+  out.q.resize(dim * n);
+  Eigen::VectorXd impulses(dim * n);
+  std::vector<Mat<dim>> row(n);
+  std::vector<int> in_row(n, -1), columns;
+  for (int c = 0; c < n; ++c) {
+    columns.clear();
+    auto add = [&](int d, const Mat<dim>& w) {
+      if (in_row[d] != c) in_row[d] = c, columns.push_back(d), row[d].setZero();
+      row[d] += w;
+    };
+    for (int end = 0; end < 2; ++end) {
+      const int body = ends[c][end];
+      const double sign = end == 0 ? -1.0 : 1.0;
+      if (body >= 0) {
+        for (const End& other : of_body[body])
+          add(other.contact, coupling<dim>(frame[c], frame[other.contact], sign * other.sign, problem.bodies[body].inv_m, problem.spin_ratio));
+      } else {
+        for (const End& other : of_wall[-1 - body])
+          add(other.contact, frame[c].transpose() * problem.walls[-1 - body].inv_m.asDiagonal() * frame[other.contact]);
+      }
+    }
+    std::sort(columns.begin(), columns.end());
+    Vec<dim> q = u[c];
+    for (int d : columns) {
+      if (d == c) out.diagonal.push_back(static_cast<int>(out.column.size()));
+      out.column.push_back(d);
+      out.blocks.push_back(row[d]);
+      q -= row[d] * r[d];
+    }
+    out.row_start.push_back(static_cast<int>(out.column.size()));
+    out.q.template segment<dim>(dim * c) = q;
+    impulses.template segment<dim>(dim * c) = r[c];
+  }
+  return {std::move(out), std::move(impulses)};
+}
+
+template <int dim>
+SolveReport solve_newton(Problem<dim>& problem, const SolverSettings& settings) {
+  auto [system, r] = delassus(problem);
+  const DelassusReport solved = solve_newton(
+      system, r,
+      DelassusSettings{.norm = Norm::energy, .tolerance = settings.tolerance, .worst = settings.worst, .rounding = settings.rounding,
+                       .max_iterations = settings.max_newton});
+  int k = 0;
+  each_contact<dim>(problem, [&](auto& c, const Tangent<dim>&) {
+    const Vec<dim> r_c = r.template segment<dim>(dim * k++);
+    const Mat<dim> frame = axes<dim>(c.n);
+    Impulse<dim> next{r_c[0], zero<Tangent<dim>>()};
+    if constexpr (dim == 2) next.t = r_c[1];
+    else next.t = r_c[1] * frame.col(1) + r_c[2] * frame.col(2);
+    const Impulse<dim> change{next.n - c.p.n, next.t - c.p.t};
+    if constexpr (requires { c.wall; })
+      push<Law::coulomb>(problem.walls[c.wall], problem.bodies[c.j], c.n, change.n, change.t, problem.spin_ratio);
+    else
+      push<Law::coulomb>(problem.bodies[c.i], problem.bodies[c.j], c.n, change.n, change.t, problem.spin_ratio);
+    c.p = next;
+  });
+  SolveReport report;
+  report.sweeps = solved.iterations;
+  report.updates = static_cast<long>(solved.iterations) * k;
+  report.residual = solved.error, report.worst = solved.worst, report.converged = solved.converged;
+  return report;
 }
 
 template SolveReport solve_nlgs(Problem<2>&, const SolverSettings&);
 template SolveReport solve_nlgs(Problem<3>&, const SolverSettings&);
 template SolveReport solve_active_set(Problem<2>&, const SolverSettings&);
 template SolveReport solve_active_set(Problem<3>&, const SolverSettings&);
+template SolveReport solve_auto(Problem<2>&, const SolverSettings&);
+template SolveReport solve_auto(Problem<3>&, const SolverSettings&);
+template SolveReport solve_newton(Problem<2>&, const SolverSettings&);
+template SolveReport solve_newton(Problem<3>&, const SolverSettings&);
+template std::pair<DelassusProblem<2>, Eigen::VectorXd> delassus(const Problem<2>&);
+template std::pair<DelassusProblem<3>, Eigen::VectorXd> delassus(const Problem<3>&);
 template void warm_start(Problem<2>&);
 template void warm_start(Problem<3>&);
 

@@ -3,6 +3,7 @@
 #pragma once
 
 #include "contact.hpp"
+#include "delassus.hpp"
 #include "neighbours.hpp"
 #include "wide.hpp"
 
@@ -49,7 +50,8 @@ struct SolverSettings {
   double tolerance = 1e-2;   // on the residual [-]
   double worst = std::numeric_limits<double>::infinity();  // on W_nn |e| of every contact [m/s]
   double rounding = 0.0;     // W_nn |e| that velocities in double precision cannot tell from 0 [m/s]
-  int max_sweeps = 5000;     // over the contacts, then as many again by the fallback
+  int max_sweeps = 5000;     // over the contacts
+  int max_newton = 500;      // Newton iterations
   int active_sweeps = 6;     // over contacts that have not settled, before each over all that these have touched
   double omega = 1.5;        // over-relaxation to start from [-]
 };
@@ -68,9 +70,21 @@ SolveReport solve_nlgs(Problem<dim>& problem, const SolverSettings& settings);
 
 // Over-relaxed Gauss-Seidel. A sweep over all contacts, then rounds: several sweeps over those whose impulse has not settled yet,
 // one over those with a grain that these have moved. What is left elsewhere is found when the residual of all is measured. The
-// relaxation falls back towards 1 when progress stalls, then to solve_nlgs.
+// relaxation falls back towards 1 when progress stalls.
 template <int dim>
 SolveReport solve_active_set(Problem<dim>& problem, const SolverSettings& settings);
+
+// Newton's method on the Delassus operator written out (delassus.hpp): few iterations however tall the scene, each a factorisation.
+template <int dim>
+SolveReport solve_newton(Problem<dim>& problem, const SolverSettings& settings);
+
+// solve_active_set; should it run out of sweeps, solve_newton, then solve_nlgs.
+template <int dim>
+SolveReport solve_auto(Problem<dim>& problem, const SolverSettings& settings);
+
+// The same problem as u = W r + q, r its impulses: contacts block by block, then those with walls. q holds the biases.
+template <int dim>
+std::pair<DelassusProblem<dim>, Eigen::VectorXd> delassus(const Problem<dim>& problem);
 
 // Adds H p of the stored impulses to the velocities.
 template <int dim>

@@ -53,9 +53,9 @@ StepReport<dim> Simulation<dim>::step(double dt) {
       h = sub_step_length(left, dt, motion);
       while (!neighbours_.valid(grains_, walls_, alert(motion.speed) / 3, h, threads_)) h *= 0.5;
     }
-    const double overlap = motion.overlap;
-    if (overlap > repair_above * settings.solve.tolerance * 2 * mean_radius_) {
-      repair_overlaps(repair_above * settings.solve.tolerance * 2 * mean_radius_);
+    const double overlap = motion.overlap, allowed = repair_above * settings.solve.tolerance * 2 * mean_radius_;
+    if (overlap > allowed) {
+      repair_overlaps(allowed);
       measure_pairs();
     }
     body_before_ = grains_.body;
@@ -124,10 +124,11 @@ void Simulation<dim>::check(double dt) {
   const int n = grains_.size();
   double mass = 0.0, r_sum = 0.0, r_min = std::numeric_limits<double>::infinity(), v2_max = 0.0;
   std::vector<char> used(materials_.names().size(), 0), grain(used.size(), 0);
-  acceleration_ = 0.0;
+  acceleration_ = max_radius_ = 0.0;
   for (int k = 0; k < n; ++k) {
     r_sum += grains_.r[k];
     r_min = std::min(r_min, grains_.r[k]);
+    max_radius_ = std::max(max_radius_, grains_.r[k]);
     v2_max = std::max(v2_max, grains_.body[k].v.squaredNorm());
     if (grains_.body[k].inv_m > 0) mass += 1.0 / grains_.body[k].inv_m;
     if (!grains_.force.empty()) acceleration_ = std::max(acceleration_, grains_.force[k].norm() * grains_.body[k].inv_m);
@@ -136,7 +137,6 @@ void Simulation<dim>::check(double dt) {
   }
   acceleration_ += gravity.norm();
   mean_radius_ = n > 0 ? r_sum / n : 0.0;
-  max_radius_ = n > 0 ? *std::max_element(grains_.r.begin(), grains_.r.end()) : 0.0;
   double wall_acceleration = 0.0;
   wall_mass_ = 0.1 * mass;
   for (const Wall<dim>& wall : walls_) {
@@ -382,8 +382,8 @@ void Simulation<dim>::find_contacts(double h, double alert, double wall_alert) {
 }
 
 template <int dim>
-SolveReport Simulation<dim>::solve_contacts(double h) {
-  Problem<dim> problem{
+Problem<dim> Simulation<dim>::problem() {
+  return {
       .bodies = grains_.body,
       .walls = walls_,
       .blocks = neighbours_.blocks,
@@ -398,7 +398,26 @@ SolveReport Simulation<dim>::solve_contacts(double h) {
       .friction = friction_,
       .threads = threads_,
   };
-  auto solve = settings.solver == Solver::nlgs ? solve_nlgs<dim> : solve_active_set<dim>;
+}
+
+template <int dim>
+std::pair<DelassusProblem<dim>, Eigen::VectorXd> Simulation<dim>::contact_problem() {
+  if (last_h_ == 0) fail("contact_problem: there is none before the first step");
+  if (!places_checked_) fail("contact_problem: grains or walls were added or moved since the last step");
+  Problem<dim> last = problem();
+  if (tangential_restitution_) last.bias_t = bias_t_, last.wall_bias_t = wall_bias_t_;
+  return delassus(last);
+}
+
+template <int dim>
+SolveReport Simulation<dim>::solve_contacts(double h) {
+  Problem<dim> problem = this->problem();
+  auto solve = [&](Problem<dim>& p, const SolverSettings& limits) {
+    if (settings.solver == Solver::nlgs) return solve_nlgs(p, limits);
+    if (settings.solver == Solver::newton) return solve_newton(p, limits);
+    if (settings.solver == Solver::active_set) return solve_active_set(p, limits);
+    return solve_auto(p, limits);
+  };
   warm_start(problem);
   SolverSettings limits = settings.solve;
   double fastest2 = 0.0;

@@ -24,6 +24,7 @@ TYPED_TEST(Solvers, the_natural_map_vanishes_exactly_where_the_contact_obeys_its
   };
   EXPECT_EQ(e2(0, 0, 0.5, 0.3), 0);             // open
   EXPECT_EQ(e2(0, 0, 0, 0), 0);                 // touching without force
+  EXPECT_EQ(natural_map<dim>({0, tangent<dim>(0)}, 0.5, tangent<dim>(0), rho, 0.0), 0);  // open, without friction
   EXPECT_LT(e2(2, 0.5, 0, 0), 1e-30);           // sticking
   EXPECT_LT(e2(2, -mu * 2, 0, 0), 1e-30);       // about to slide
   EXPECT_LT(e2(2, -mu * 2, 0, 0.9), 1e-30);     // sliding, friction against it
@@ -74,6 +75,7 @@ Simulation<dim> column(int n) {
 TYPED_TEST(Solvers, a_step_that_misses_its_tolerance_throws_unless_accepted_and_then_counts_it) {
   constexpr int dim = TypeParam::value;
   auto sim = column<dim>(30);
+  sim.settings.solver = Solver::active_set;
   sim.settings.solve.max_sweeps = 1;
   try {
     sim.step(1e-3);
@@ -85,7 +87,7 @@ TYPED_TEST(Solvers, a_step_that_misses_its_tolerance_throws_unless_accepted_and_
   auto report = sim.step(1e-3);
   EXPECT_EQ(report.unconverged, 1);
   EXPECT_GT(report.residual, sim.settings.solve.tolerance);
-  EXPECT_LE(report.sweeps, 2);  // one, and as many again by the fallback
+  EXPECT_LE(report.sweeps, 1);
   sim.settings.solve.max_sweeps = 10000;
   report = sim.step(1e-3);
   EXPECT_EQ(report.unconverged, 0);
