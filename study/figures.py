@@ -203,3 +203,55 @@ def _force_chains(sim, period):
     leaves = np.abs(end[:, 0]) > period / 2
     shift = np.column_stack([np.copysign(period, end[leaves, 0]), np.zeros(leaves.sum())])
     return np.concatenate([segments, segments[leaves] - shift[:, None, :]]), np.concatenate([force, force[leaves]])
+
+
+@_styled
+def plot_errors(path, iterations, errors, tolerance):
+    """Error over iterations, both on logarithmic axes, and the tolerance.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+    iterations : (n,) sequence
+    errors : (n,) sequence
+        [-]
+    tolerance : float
+    """
+    figure, axis = _figure(1, 1, (6, 4))
+    axis.loglog(np.asarray(iterations) + 1, errors, color=BLUE, marker=".")
+    axis.axhline(tolerance, color=RED, linewidth=0.8, label="tolerance")
+    axis.set_xlabel("iterations + 1")
+    axis.set_ylabel("error [-]")
+    axis.legend()
+    figure.savefig(path)
+
+
+@_styled
+def plot_lines(path, x_label, y_label, panels, scales=("log", "log"), steps=False, markers_only=False):
+    """Curves side by side, panels share their axes.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+    x_label, y_label : str
+    panels : list of (title, [(label, colour, x, y), ...])
+        x, y (n,) arrays; NaN: no point.
+    scales : (str, str)
+        Of matplotlib's axes.
+    steps : bool
+        y keeps its value until the next x.
+    markers_only : bool
+        Points, and the line y = x.
+    """
+    figure, axes = _figure(1, len(panels), (1.5 + 3.5 * len(panels), 3.8), sharex=True, sharey=True, squeeze=False)
+    for axis, (title, curves) in zip(axes[0], panels):
+        for label, colour, x, y in curves:
+            axis.plot(x, y, color=colour, marker="" if steps else ".", linestyle="none" if markers_only else "-", label=label,
+                      drawstyle="steps-post" if steps else "default")
+        if markers_only:
+            ends = [min(np.min(x) for _, _, x, _ in curves), max(np.max(x) for _, _, x, _ in curves)]
+            axis.plot(ends, ends, color=FAINT, linewidth=0.8)
+        axis.set(xscale=scales[0], yscale=scales[1], title=title, xlabel=x_label)
+        axis.legend()
+    axes[0, 0].set_ylabel(y_label)
+    figure.savefig(path)
