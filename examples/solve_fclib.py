@@ -49,7 +49,8 @@ def main():
         r, _ = grains.read_solution(flags.out / "solution.hdf5")
     results = {"dim": problem.dim, "contacts": problem.contacts, "solver": found.solver, "iterations": found.iterations,
                "error": problem.error(r), "converged": found.converged, "wall_time": found.wall_time, "error_history": found.error_history}
-    study.write_results(flags.out / "results.json", results)
+    with parser.user_errors(OSError):
+        study.write_results(flags.out / "results.json", results)
     study.print_summary(f"{flags.file.name}: {'solved' if found.converged else 'not solved'} by {found.solver}", results,
                         {"dim": "", "contacts": "", "iterations": "", "error": "-", "wall_time": "s"})
     if not flags.no_plots:

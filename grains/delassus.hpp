@@ -77,7 +77,9 @@ DelassusReport solve_auto(const DelassusProblem<dim>& problem, Eigen::VectorXd& 
 // How far r is from the solution: sqrt(dr . W dr / r* . W r*), the energy of what is still missing of the velocities that contacts
 // have to make, relative to all they make. A small natural map is no such thing: it is local, and in a pile of L layers hides errors
 // L^2 times larger. The solution r* is estimated by one Newton step, contacts that touch without a force taken as closed, with a
-// proximal term of 1e-8, which errors over up to 1e4 layers do not feel. Costs one factorisation. Infinity: none could be made.
+// proximal term of 1e-8, which errors over up to 1e4 layers do not feel. Where that does not bring the natural map down tenfold, many
+// contacts still have to open or slide: then by solve_auto to a thousandth of the natural map of r, and such a step from there, which
+// shows what sweeps have left. Infinity: no step could be made. Costs a factorisation, or a solve and two.
 template <int dim>
 double global_error(const DelassusProblem<dim>& problem, const Eigen::VectorXd& r);
 

@@ -310,7 +310,7 @@ void bind(py::module_& m, const char* suffix) {
            },
            "Estimate of how far the last sub-step's solution is from the exact one, relative, in the energy norm: what its velocities\n"
            "still miss over all that contacts change in them [-]; inf where there was none. The residual is local and hides errors\n"
-           "that vary smoothly over many layers. Costs a factorisation: for a look, not for every step.")
+           "that vary smoothly over many layers. Costs a factorisation, or a solve to a thousandth of the residual: for a look, not for every step.")
       .def("state",
            [](const Sim& s) {
              const std::vector<char> bytes = s.state();

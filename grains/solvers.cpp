@@ -418,7 +418,9 @@ SolveReport solve_auto(Problem<dim>& problem, const SolverSettings& settings) {
     report = {report.sweeps + more.sweeps, report.updates + more.updates, more.residual, more.worst, more.converged};
   };
   const std::size_t contacts = std::accumulate(problem.count.begin(), problem.count.end(), problem.wall_contacts.size());
-  if (!report.converged && contacts <= newton_contacts) go_on(solve_newton(problem, settings));
+  SolverSettings few = settings;
+  few.max_newton = std::max(settings.max_newton / 5, 1);  // near the solution it converges soon or cycles
+  if (!report.converged && contacts <= newton_contacts) go_on(solve_newton(problem, few));
   if (!report.converged) go_on(solve_nlgs(problem, settings));
   return report;
 }

@@ -51,7 +51,7 @@ struct SolverSettings {
   double worst = std::numeric_limits<double>::infinity();  // on W_nn |e| of every contact [m/s]
   double rounding = 0.0;     // W_nn |e| that velocities in double precision cannot tell from 0 [m/s]
   int max_sweeps = 5000;     // over the contacts
-  int max_newton = 500;      // Newton iterations
+  int max_newton = 500;      // Newton iterations, each a factorisation; a fifth of them where they are the fallback
   int active_sweeps = 6;     // over contacts that have not settled, before each over all that these have touched
   double omega = 1.5;        // over-relaxation to start from [-]
 };

@@ -61,9 +61,9 @@ class ContactProblem:
         n = dim * self.friction.size
         if self.friction.ndim != 1 or self.q.shape != (n,):
             raise ValueError(f"ContactProblem: q must have {dim} entries per contact, got shape {self.q.shape} for friction of shape {self.friction.shape}")
-        if W.shape != (n, n):
-            raise ValueError(f"ContactProblem: W must be {n} x {n} for {self.friction.size} contacts in {dim}D, got {W.shape}")
-        self.W = sparse.csr_matrix(W, dtype=float)
+        self.W = sparse.csr_matrix(W if sparse.issparse(W) else np.asarray(W, float), dtype=float, copy=True)
+        if self.W.shape != (n, n):
+            raise ValueError(f"ContactProblem: W must be {n} x {n} for {self.friction.size} contacts in {dim}D, got {self.W.shape}")
         self.W.sum_duplicates()
         for name, values in (("W", self.W.data), ("q", self.q), ("friction", self.friction)):
             if not np.isfinite(values).all():
@@ -85,6 +85,8 @@ class ContactProblem:
         Zero exactly at a solution. It means little for a problem with units: see `dimensionless`.
         """
         r = np.asarray(r, float)
+        if r.shape != self.q.shape or not np.isfinite(r).all():
+            raise ValueError(f"error: r must be {self.q.size} finite numbers, got {np.array2string(r, threshold=4)} of shape {r.shape}")
         u = self.W @ r + self.q
         r_c, mu = r.reshape(-1, self.dim), self.friction
         z = r_c - u.reshape(-1, self.dim)
@@ -125,8 +127,8 @@ class ContactProblem:
     def global_error(self, r):
         """Estimate of sqrt(dr . W dr / r* . W r*), dr = r* - r: how far r is from the solution r*, in the energy norm [-].
 
-        `error` is local: in a pile of L layers a small one hides errors L^2 times larger. Costs one factorisation of W; inf where none
-        could be made.
+        `error` is local: in a pile of L layers a small one hides errors L^2 times larger. Costs a factorisation of W, or a solve to a
+        thousandth of r's error; inf where no estimate could be made.
         """
         return _grains.contact_problem_global_error(*self._arrays(), r)
 
@@ -147,7 +149,7 @@ class ContactProblem:
         return ContactProblem(self.dim, self.W / w, self.q / velocity, self.friction, self.title, text), impulse, velocity
 
     def _arrays(self):
-        return self.dim, self.W.indptr, self.W.indices, self.W.data, self.q, self.friction
+        return self.dim, self.W.indptr.astype(np.int32), self.W.indices.astype(np.int32), self.W.data, self.q, self.friction
 
 
 def contact_problem(sim, title="", description=""):
@@ -207,10 +209,15 @@ def read_fclib(path):
             kind = "a global problem (fclib_global): condense it to W and q first" if "fclib_global" in file else "no group fclib_local"
             raise ValueError(f"read_fclib: {path} holds {kind}")
         local = file["fclib_local"]
-        if "R" in local or "V" in local:
-            raise ValueError(f"read_fclib: {path} has equality constraints (V, R): eliminate them first")
+        if "R" in local or "V" in local or "vectors/s" in local:
+            raise ValueError(f"read_fclib: {path} has equality constraints (V, R, s): eliminate them first")
+        if "vectors/q" not in local:
+            raise ValueError(f"read_fclib: {path} has no vectors/q" + (", only vectors/a: rename that, an old FCLIB wrote q so"
+                                                                       if "vectors/a" in local else ""))
         m, n, nz = (int(local["W"][name][0]) for name in ("m", "n", "nz"))
         p, i, x = (local["W"][name][()] for name in ("p", "i", "x"))
+        if nz < -2 or (nz >= 0 and min(len(p), len(i), len(x)) < nz):
+            raise ValueError(f"read_fclib: {path}: nz must be -1 (columns), -2 (rows) or the number of triplets, got {nz} with {len(x)} values")
         if nz >= 0:
             matrix = sparse.coo_matrix((x[:nz], (i[:nz], p[:nz])), shape=(m, n))
         else:
@@ -224,7 +231,17 @@ def read_fclib(path):
 
 def read_solution(path):
     """(r, u) of the group `solution` of an FCLIB file, or None where it has none. Raises as `read_fclib`."""
-    return _read(path, lambda file: (file["solution/r"][()], file["solution/u"][()]) if "solution" in file else None, "read_solution")
+
+    def read(file):
+        if "solution" not in file:
+            return None
+        r, u = (np.asarray(file[f"solution/{name}"][()], float) for name in ("r", "u"))
+        n = int(file["fclib_local/W/m"][0])
+        if r.shape != (n,) or u.shape != (n,) or not (np.isfinite(r).all() and np.isfinite(u).all()):
+            raise ValueError(f"read_solution: {path}: r and u must be {n} finite numbers each, got shapes {r.shape} and {u.shape}")
+        return r, u
+
+    return _read(path, read, "read_solution")
 
 
 def _read(path, read, where):

@@ -115,6 +115,10 @@ def broken(path, how):
             file.create_group("fclib_local/R")
         elif how == "no q":
             file.move("fclib_local/vectors/q", "fclib_local/vectors/a")
+        elif how == "kind":
+            file["fclib_local/W/nz"][0] = -7
+        elif how == "triplets":
+            file["fclib_local/W/nz"][0] = 10**6
         elif how == "short":
             del file["fclib_local/vectors/mu"]
             file["fclib_local/vectors/mu"] = np.ones(3)
@@ -125,7 +129,7 @@ def broken(path, how):
 
 
 @pytest.mark.parametrize("how, says", [("cut", "damaged"), ("global", "fclib_global"), ("nothing", "no group fclib_local"),
-                                       ("constraints", "equality constraints"), ("no q", "damaged"), ("short", "entries per contact"),
+                                       ("constraints", "equality constraints"), ("no q", "only vectors/a"), ("kind", "nz must be"), ("triplets", "nz must be"), ("short", "entries per contact"),
                                        ("index", "a.hdf5"), ("nan", "finite")])
 def test_a_file_that_cannot_be_used_says_why(tmp_path, how, says):
     broken(tmp_path / "a.hdf5", how)
@@ -149,11 +153,29 @@ def test_a_file_that_cannot_be_used_says_why(tmp_path, how, says):
     (lambda: one().solve(max_iterations=0), "max_iterations must be >= 1"),
     (lambda: one().solve(start=np.zeros(5)), "start must have 2 entries, got 5"),
     (lambda: one().solve(start=np.full(2, np.nan)), "start must be finite"),
+    (lambda: one(q=(0, 0)).error([np.nan, 0]), "r must be 2 finite numbers"),
+    (lambda: one().error(np.zeros(5)), "r must be 2 finite numbers"),
     (lambda: one().global_error(np.zeros(5)), "must have 2 entries"),
 ])
 def test_bad_input_names_the_rule(make, says):
     with pytest.raises(ValueError, match=says):
         make()
+
+
+def test_the_matrix_may_be_of_any_kind_and_stays_as_it_was():
+    twice = sparse.csr_matrix((np.array([0.5, 0.5, 1.0]), np.array([0, 0, 1], np.int64), np.array([0, 2, 3], np.int64)), shape=(2, 2))
+    for W in (twice, twice.tocoo(), [[1, 0], [0, 1]], np.eye(2, dtype=int)):
+        assert grains.ContactProblem(2, W, (-1.0, 0.3), [0.5]).solve().r == pytest.approx([1, -0.3])
+    assert twice.nnz == 3
+
+
+def test_a_solution_that_does_not_fit_is_refused(tmp_path):
+    problem = grains.read_fclib(DATA[0])
+    grains.write_fclib(tmp_path / "a.hdf5", problem, problem.solve())
+    with h5py.File(tmp_path / "a.hdf5", "r+") as file:
+        file["solution/r"][0] = np.nan
+    with pytest.raises(ValueError, match="a.hdf5: r and u must be"):
+        grains.read_solution(tmp_path / "a.hdf5")
 
 
 def test_no_contacts_are_no_problem():
