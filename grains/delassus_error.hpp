@@ -55,9 +55,9 @@ class Best {
   double error_ = std::numeric_limits<double>::infinity(), worst_ = 0.0;
 };
 
-// newton.cpp. alpha: weight of the first proximal term over W_nn.
+// newton.cpp
 template <int dim>
 void iterate_newton(const DelassusProblem<dim>& problem, Eigen::VectorXd& r, const DelassusSettings& settings, DelassusReport& report,
-                    Best<dim>& best, double alpha = 1e-3);
+                    Best<dim>& best);
 
 }  // namespace quicksand

@@ -150,17 +150,18 @@ class ProximalProblem {
 
 // Of 1e-2 to 1e-6 and factors 0.2 and 0.05: the eight third-party problems are solved with any of them; a small alpha reaches across more
 // layers of a pile in one step (about 1/sqrt(alpha)), a large one needs fewer steps in systems with more contacts than freedoms.
-constexpr double least_alpha = 1e-12, falls_by = 0.05;
+constexpr double first_alpha = 1e-3, least_alpha = 1e-12, falls_by = 0.05;
 constexpr int most_inner = 30, most_outer = 60;
 
 }  // namespace
 
 template <int dim>
 void iterate_newton(const DelassusProblem<dim>& problem, Eigen::VectorXd& r, const DelassusSettings& settings, DelassusReport& report,
-                    Best<dim>& best, double alpha) {
+                    Best<dim>& best) {
   report.solver = "newton";
   BlockLU<dim> lu;
   Eigen::VectorXd centre = r, dr, next;
+  double alpha = first_alpha;
   for (int outer = 0; outer < most_outer && !report.converged; ++outer) {
     ProximalProblem<dim> proximal(problem, centre, alpha);
     double f = proximal.merit(r);
@@ -230,10 +231,9 @@ double global_error(const DelassusProblem<dim>& problem, const Eigen::VectorXd& 
   return of_all > 0 ? size(solution - r) / of_all : unknown;
 }
 
-#define INSTANTIATE(dim)                                                                                                      \
-  template void iterate_newton(const DelassusProblem<dim>&, Eigen::VectorXd&, const DelassusSettings&, DelassusReport&, Best<dim>&, \
-                               double);                                                                                        \
-  template double global_error(const DelassusProblem<dim>&, const Eigen::VectorXd&);                                          \
+#define INSTANTIATE(dim)                                                                                                             \
+  template void iterate_newton(const DelassusProblem<dim>&, Eigen::VectorXd&, const DelassusSettings&, DelassusReport&, Best<dim>&); \
+  template double global_error(const DelassusProblem<dim>&, const Eigen::VectorXd&);                                                 \
   template DelassusReport solve_newton(const DelassusProblem<dim>&, Eigen::VectorXd&, const DelassusSettings&);
 INSTANTIATE(2)
 INSTANTIATE(3)

@@ -84,6 +84,16 @@ Vec<dim> random_vector(std::mt19937& random, double most) {
   return v;
 }
 
+// Grains of radius 1 mm on top of each other on a floor, touching, at rest.
+template <int dim>
+Simulation<dim> column(int layers) {
+  auto sim = scene<dim>(0.3);
+  sim.gravity = in_plane<dim>(0, -g);
+  sim.add_plane(Vec<dim>::Zero(), in_plane<dim>(0, 1), "wall");
+  for (int k = 0; k < layers; ++k) add<dim>(sim, in_plane<dim>(0, (2 * k + 1) * 1e-3), 1e-3);
+  return sim;
+}
+
 // Grains of radii 0.8 to 1.2 mm near the points of a square or cubic lattice of spacing 3 mm around 0, with random velocities up
 // to `speed` along each axis. Adds cells[0] x cells[1] (x cells[2]) of them.
 template <int dim>

@@ -97,15 +97,6 @@ TYPED_TEST(Delassus, all_solvers_of_problems_written_out_agree_on_the_velocities
   }
 }
 
-template <int dim>
-Simulation<dim> column(int layers) {
-  auto sim = scene<dim>(0.3);
-  sim.gravity = in_plane<dim>(0, -g);
-  sim.add_plane(Vec<dim>::Zero(), in_plane<dim>(0, 1), "wall");
-  for (int k = 0; k < layers; ++k) add<dim>(sim, in_plane<dim>(0, (2 * k + 1) * 1e-3), 1e-3);
-  return sim;
-}
-
 // Sweeps carry weight by one layer at a time, a Newton step through all of them.
 TYPED_TEST(Delassus, newton_carries_the_weight_of_320_layers_in_a_few_iterations) {
   constexpr int dim = TypeParam::value;

@@ -62,15 +62,6 @@ TYPED_TEST(Solvers, one_update_of_a_contact_obeys_the_law) {
   }
 }
 
-template <int dim>
-Simulation<dim> column(int n) {
-  auto sim = scene<dim>(0.3);
-  sim.gravity = in_plane<dim>(0, -g);
-  sim.add_plane(Vec<dim>::Zero(), in_plane<dim>(0, 1), "wall");
-  for (int k = 0; k < n; ++k) add<dim>(sim, in_plane<dim>(0, (2 * k + 1) * 1e-3), 1e-3);
-  return sim;
-}
-
 // From zero impulses a sweep carries weight by one contact: one sweep cannot bring 30 to balance.
 TYPED_TEST(Solvers, a_step_that_misses_its_tolerance_throws_unless_accepted_and_then_counts_it) {
   constexpr int dim = TypeParam::value;
