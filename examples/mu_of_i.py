@@ -214,16 +214,16 @@ def main():
     flags = parse_flags()
     try:
         failed = run_all(flags)
+        runs = collect(flags)
+        results = fit_all(runs, flags.size_ratios)
+        study.write_results(flags.out / "results.json", results)
+        text = tables(runs, results)
+        (flags.out / "tables.md").write_text(text)
+        print(text)
+        plot(flags.out, runs, results)
     except KeyboardInterrupt:
         print("mu_of_i.py: stopped; the same command goes on", file=sys.stderr)
         return 130
-    runs = collect(flags)
-    results = fit_all(runs, flags.size_ratios)
-    study.write_results(flags.out / "results.json", results)
-    text = tables(runs, results)
-    (flags.out / "tables.md").write_text(text)
-    print(text)
-    plot(flags.out, runs, results)
     for message in failed:
         print(f"mu_of_i.py: {message}", file=sys.stderr)
     return 1 if failed else 0
