@@ -71,7 +71,7 @@ void Simulation<dim>::check_grains(std::span<const Vec<dim>> x, std::span<const 
 template <int dim>
 void Simulation<dim>::places_changed() {
   neighbours_.forget();
-  places_checked_ = false;
+  places_checked_ = contacts_current_ = false;
 }
 
 template <int dim>
@@ -154,6 +154,7 @@ void Simulation<dim>::drive(int wall, int axis, double velocity) {
   walls_[wall].loaded[axis] = false;
   walls_[wall].inv_m[axis] = walls_[wall].load[axis] = 0.0;
   walls_[wall].v[axis] = velocity;
+  contacts_current_ = false;
 }
 
 template <int dim>
@@ -164,6 +165,7 @@ void Simulation<dim>::set_load(int wall, int axis, double force, std::optional<d
   walls_[wall].loaded[axis] = true;
   walls_[wall].load[axis] = force;
   if (mass) walls_[wall].mass = *mass;
+  contacts_current_ = false;
 }
 
 template <int dim>
@@ -212,6 +214,7 @@ template <int dim>
 void Simulation<dim>::set_inertia(double ratio) {
   if (!(ratio > 1e-30 && ratio <= 1)) fail("set_inertia: I/(m r^2) must be in (0, 1], got {}", ratio);
   grains_.inertia = ratio;
+  contacts_current_ = false;
 }
 
 template <int dim>
@@ -241,6 +244,7 @@ void Simulation<dim>::set_position(std::span<const Vec<dim>> x) {
 template <int dim>
 void Simulation<dim>::set_velocity(std::span<const Vec<dim>> v) {
   set_by_id(v.size(), "set_velocity", "velocity");
+  contacts_current_ = false;
   for (std::size_t k = 0; k < v.size(); ++k) check_finite(v[k], "set_velocity", "velocity [m/s]", k);
   for (int k = 0; k < grains_.size(); ++k)
     if (grains_.id[k] >= 0) grains_.body[k].v = v[grains_.id[k]];
@@ -249,6 +253,7 @@ void Simulation<dim>::set_velocity(std::span<const Vec<dim>> v) {
 template <int dim>
 void Simulation<dim>::set_spin(std::span<const Spin<dim>> omega) {
   set_by_id(omega.size(), "set_spin", "spin");
+  contacts_current_ = false;
   for (std::size_t k = 0; k < omega.size(); ++k)
     check_finite(std::sqrt(squared(omega[k])), "set_spin", "spin [rad/s]", k);
   for (int k = 0; k < grains_.size(); ++k)

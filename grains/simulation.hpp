@@ -106,6 +106,7 @@ class Simulation {
   ContactList<dim> contacts() const;
 
   // The contact problem of the last sub-step and the impulses that were found for it [N s] (2D: N s/m); see delassus().
+  // Throws std::invalid_argument where no sub-step was made since the scene was changed from outside or restored.
   std::pair<DelassusProblem<dim>, Eigen::VectorXd> contact_problem();
 
   // State by id; for changes from outside between steps.
@@ -163,6 +164,7 @@ class Simulation {
   int n_free_ = 0, n_fixed_ = 0;
   double time_ = 0.0;
   double last_h_ = 0.0;  // sub-step that the stored impulses belong to [s]
+  bool contacts_current_ = false;  // velocities are those that the last sub-step's contacts left
   bool places_checked_ = false;  // by check_places(), since grains or walls were last added or moved from outside
 
   // Scratch of a sub-step; contacts sit in the slots of their block's pairs.

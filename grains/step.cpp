@@ -64,6 +64,7 @@ StepReport<dim> Simulation<dim>::step(double dt) {
     accelerate(h);
     find_contacts(h, alert(motion.speed), alert(motion.wall_speed));
     const SolveReport solved = solve_contacts(h);
+    contacts_current_ = true;
     account(h, report);
     move(h);
 
@@ -402,8 +403,8 @@ Problem<dim> Simulation<dim>::problem() {
 
 template <int dim>
 std::pair<DelassusProblem<dim>, Eigen::VectorXd> Simulation<dim>::contact_problem() {
-  if (last_h_ == 0) fail("contact_problem: there is none before the first step");
-  if (!places_checked_) fail("contact_problem: grains or walls were added or moved since the last step");
+  if (!contacts_current_)
+    fail("contact_problem: there is none before the first step, nor after the scene was changed from outside or restored; make a step first");
   Problem<dim> last = problem();
   if (tangential_restitution_) last.bias_t = bias_t_, last.wall_bias_t = wall_bias_t_;
   return delassus(last);

@@ -84,9 +84,7 @@ class ContactProblem:
 
         Zero exactly at a solution. It means little for a problem with units: see `dimensionless`.
         """
-        r = np.asarray(r, float)
-        if r.shape != self.q.shape or not np.isfinite(r).all():
-            raise ValueError(f"error: r must be {self.q.size} finite numbers, got {np.array2string(r, threshold=4)} of shape {r.shape}")
+        r = self._impulses(r, "error")
         u = self.W @ r + self.q
         r_c, mu = r.reshape(-1, self.dim), self.friction
         z = r_c - u.reshape(-1, self.dim)
@@ -120,6 +118,7 @@ class ContactProblem:
         Solution
             The best r found; `converged` says whether it is within the tolerance.
         """
+        start = None if start is None else self._impulses(start, "solve")
         start_time = time.perf_counter()
         found = _grains.solve_contact_problem(*self._arrays(), solver, tolerance, max_iterations, start)
         return Solution(**found, wall_time=time.perf_counter() - start_time)
@@ -130,7 +129,7 @@ class ContactProblem:
         `error` is local: in a pile of L layers a small one hides errors L^2 times larger. Costs a factorisation of W, or a solve to a
         thousandth of r's error; inf where no estimate could be made.
         """
-        return _grains.contact_problem_global_error(*self._arrays(), r)
+        return _grains.contact_problem_global_error(*self._arrays(), self._impulses(r, "global_error"))
 
     def dimensionless(self):
         """The same problem as FCLIB's collection scales it: mean diagonal of W = 1, |q| = 1.
@@ -147,6 +146,12 @@ class ContactProblem:
         note = f"dimensionless: r in units of {impulse:.17g}, u in units of {velocity:.17g}"
         text = f"{self.description}; {note}" if self.description else note
         return ContactProblem(self.dim, self.W / w, self.q / velocity, self.friction, self.title, text), impulse, velocity
+
+    def _impulses(self, r, where):
+        r = np.asarray(r, float)
+        if r.shape != self.q.shape or not np.isfinite(r).all():
+            raise ValueError(f"{where}: r must be {self.q.size} finite numbers, got {np.array2string(r, threshold=4)} of shape {r.shape}")
+        return r
 
     def _arrays(self):
         return self.dim, self.W.indptr.astype(np.int32), self.W.indices.astype(np.int32), self.W.data, self.q, self.friction

@@ -151,11 +151,11 @@ def test_a_file_that_cannot_be_used_says_why(tmp_path, how, says):
     (lambda: one().solve("lu"), "solver must be 'auto', 'nlgs' or 'newton', got 'lu'"),
     (lambda: one().solve(tolerance=0), "tolerance must be > 0"),
     (lambda: one().solve(max_iterations=0), "max_iterations must be >= 1"),
-    (lambda: one().solve(start=np.zeros(5)), "start must have 2 entries, got 5"),
-    (lambda: one().solve(start=np.full(2, np.nan)), "start must be finite"),
+    (lambda: one().solve(start=np.zeros(5)), "solve: r must be 2 finite numbers"),
+    (lambda: one().solve(start=np.full(2, np.nan)), "solve: r must be 2 finite numbers"),
     (lambda: one(q=(0, 0)).error([np.nan, 0]), "r must be 2 finite numbers"),
     (lambda: one().error(np.zeros(5)), "r must be 2 finite numbers"),
-    (lambda: one().global_error(np.zeros(5)), "must have 2 entries"),
+    (lambda: one().global_error(np.zeros(5)), "global_error: r must be 2 finite numbers"),
 ])
 def test_bad_input_names_the_rule(make, says):
     with pytest.raises(ValueError, match=says):

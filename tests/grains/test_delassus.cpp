@@ -153,7 +153,25 @@ TYPED_TEST(Delassus, there_is_no_contact_problem_before_a_step_nor_after_a_chang
   EXPECT_THROW(sim.contact_problem(), std::invalid_argument);
   sim.step(1e-3);
   EXPECT_EQ(sim.contact_problem().first.contacts(), 3);
+  const std::vector<char> state = sim.state();
+  auto twin = column<dim>(0);
+  const auto refuses = [](Simulation<dim>& of) {
+    EXPECT_THROW(of.contact_problem(), std::invalid_argument);
+    of.step(1e-3);
+    EXPECT_EQ(of.contact_problem().first.contacts(), 3);
+  };
+  twin.restore(state);  // holds no contacts of its own
+  refuses(twin);
+  sim.restore(state);
+  refuses(sim);
+  sim.set_velocity(velocities(sim));
+  refuses(sim);
+  sim.set_spin(spins(sim));
+  refuses(sim);
+  sim.drive(0, 0, 0.0);
+  refuses(sim);
   add<dim>(sim, in_plane<dim>(0.1, 0.1), 1e-3);
+  sim.check(1e-3);
   EXPECT_THROW(sim.contact_problem(), std::invalid_argument);
 }
 
