@@ -6,14 +6,15 @@ The file holds u = W r + q and friction (`fclib_local`, HDF5); r and u obey Sign
 
 Flags
     --tolerance E       on the error below [-] (1e-8)
-    --solver NAME       auto, nlgs (nonlinear Gauss-Seidel) or newton (semismooth, with proximal points) (auto)
+    --solver NAME       auto, nlgs (nonlinear Gauss-Seidel), accelerated (the same with Nesterov's extrapolation) or newton (semismooth,
+                        with proximal points) (auto)
     --max-iterations N  sweeps and Newton iterations (100000)
     --out DIR           where results.json, solution.hdf5 and error.png go (out/solve_fclib)
     --no-plots          no figure
 
 results.json; nothing here has units:
     dim contacts
-    solver          that made the last iterations: nlgs or newton
+    solver          that made the last iterations: nlgs, accelerated or newton
     iterations      sweeps and Newton iterations
     error           |e| / max(|q|, |u|, |r|), e = r - P_K(r - (u + mu |u_t| n)), of the r in solution.hdf5
     converged       whether it is within the tolerance; exit status 1 if not
@@ -32,7 +33,7 @@ def parse_flags():
     parser = study.CommandLine(__doc__)
     parser.add_argument("file", type=Path)
     parser.add_argument("--tolerance", type=study.number("", above=0), default=1e-8)
-    parser.add_argument("--solver", choices=("auto", "nlgs", "newton"), default="auto")
+    parser.add_argument("--solver", choices=("auto", "nlgs", "accelerated", "newton"), default="auto")
     parser.add_argument("--max-iterations", type=study.whole(at_least=1), default=100000)
     parser.add_argument("--out", type=Path, default=Path("out/solve_fclib"))
     parser.add_argument("--no-plots", action="store_true")

@@ -38,11 +38,10 @@ struct DelassusSettings {
   double worst = std::numeric_limits<double>::infinity();  // on W_nn |e| of every contact, rho = 1/W_nn
   double rounding = 0.0;                                   // W_nn |e| that is as good as 0
   int max_iterations = 100000;
-  double omega = 1.0;  // of the sweeps
 };
 
 struct DelassusReport {
-  std::string solver;                  // that made the last iterations: "nlgs" or "newton"
+  std::string solver;                  // that made the last iterations: "nlgs", "accelerated" or "newton"
   int iterations = 0;                  // sweeps and Newton iterations
   double error = 0.0, worst = 0.0;     // at the end
   bool converged = false;
@@ -61,16 +60,20 @@ template <int dim>
 Eigen::VectorXd contact_velocity(const DelassusProblem<dim>& problem, const Eigen::VectorXd& r);
 
 // All start from `r` and leave the best found there; its error is in the report.
-// Nonlinear Gauss-Seidel, every contact solved exactly in its turn: M. Jean, CMAME 177 (1999); over-relaxed by omega.
+// Nonlinear Gauss-Seidel, every contact solved exactly in its turn: M. Jean, CMAME 177 (1999).
 template <int dim>
 DelassusReport solve_nlgs(const DelassusProblem<dim>& problem, Eigen::VectorXd& r, const DelassusSettings& settings);
+
+// Symmetric Gauss-Seidel with Nesterov's extrapolation, as that of solvers.hpp.
+template <int dim>
+DelassusReport solve_accelerated(const DelassusProblem<dim>& problem, Eigen::VectorXd& r, const DelassusSettings& settings);
 
 // Semismooth Newton (Alart and Curnier, CMAME 92 (1991)) inside a proximal point iteration (Rockafellar, SIAM J. Control Optim. 14
 // (1976)), which makes systems with more contacts than freedoms regular and takes nothing from the solution.
 template <int dim>
 DelassusReport solve_newton(const DelassusProblem<dim>& problem, Eigen::VectorXd& r, const DelassusSettings& settings);
 
-// Sweeps while their progress promises to be cheaper than Newton's factorisations, then Newton; sweeps again should it fail.
+// solve_accelerated while its progress promises to be cheaper than Newton's factorisations, then Newton; sweeps again should it fail.
 template <int dim>
 DelassusReport solve_auto(const DelassusProblem<dim>& problem, Eigen::VectorXd& r, const DelassusSettings& settings);
 

@@ -55,6 +55,11 @@ Real squared(const Real& t) {
   return t * t;
 }
 inline double squared(const Vec<3>& t) { return t.squaredNorm(); }
+template <class Real>
+Real product(const Real& a, const Real& b) {
+  return a * b;
+}
+inline double product(const Vec<3>& a, const Vec<3>& b) { return a.dot(b); }
 
 template <class Real>
 Real length(const Real& t) {

@@ -106,7 +106,7 @@ WallHandle<dim> add_driven(const py::object& self, const char* where, const PerA
   return {self, &simulation, number};
 }
 
-constexpr std::array solver_names{"auto", "nlgs", "active_set", "newton"};  // in the order of Solver
+constexpr std::array solver_names{"auto", "nlgs", "active_set", "accelerated", "newton"};  // in the order of Solver
 
 Solver solver_named(const std::string& name) {
   for (std::size_t k = 0; k < solver_names.size(); ++k)
@@ -168,8 +168,9 @@ py::dict solve_contact_problem(const Indices& row_start, const Indices& column, 
   Solve solve = nullptr;
   if (solver == "auto") solve = solve_auto<dim>;
   if (solver == "nlgs") solve = solve_nlgs<dim>;
+  if (solver == "accelerated") solve = solve_accelerated<dim>;
   if (solver == "newton") solve = solve_newton<dim>;
-  if (!solve) fail("{}: solver must be 'auto', 'nlgs' or 'newton', got '{}'", where, solver);
+  if (!solve) fail("{}: solver must be 'auto', 'nlgs', 'accelerated' or 'newton', got '{}'", where, solver);
   DelassusReport report;
   {
     py::gil_scoped_release release;
@@ -193,6 +194,7 @@ void bind(py::module_& m, const char* suffix) {
       .def_readonly("sub_steps", &Report::sub_steps)
       .def_readonly("sweeps", &Report::sweeps, "of all sub-steps")
       .def_readonly("updates", &Report::updates, "contacts visited in the sweeps")
+      .def_readonly("solve_time", &Report::solve_time, "wall time of the contact solver [s]")
       .def_readonly("candidates", &Report::candidates, "contacts within the alert distance, mean over sub-steps")
       .def_readonly("contacts", &Report::contacts, "load-bearing contacts between grains, mean over sub-steps")
       .def_readonly("residual", &Report::residual, "largest of the sub-steps, energy norm of the natural map [-]")
@@ -351,7 +353,7 @@ void bind(py::module_& m, const char* suffix) {
              s.set_force(as_span<Vec<dim>>(f, "set_force", "force", s.count()));
            }, "force"_a, "External force on each grain from now on, (n, dim) [N] (2D: N/m); None: none.")
       .def_property("solver", [](const Sim& s) { return solver_names[static_cast<int>(s.settings.solver)]; },
-                    [](Sim& s, const std::string& v) { s.settings.solver = solver_named(v); }, "'auto': 'active_set', then 'newton' and 'nlgs' should it run out of sweeps")
+                    [](Sim& s, const std::string& v) { s.settings.solver = solver_named(v); }, "'auto': 'active_set', after some hundred sweeps 'accelerated', then 'newton' and 'nlgs' should it run out of sweeps")
       .def_property("sub_step_rule", [](const Sim& s) { return s.settings.sub_steps == SubSteps::relative ? "relative" : "absolute"; },
                     [](Sim& s, const std::string& v) { s.settings.sub_steps = sub_steps_named(v); },
                     "'relative': motion of neighbours; 'absolute': ceil(8 v_max dt/r_min), the rule of the MigFlow thesis");

@@ -9,7 +9,7 @@
 
 namespace quicksand {
 
-enum class Solver { automatic, nlgs, active_set, newton };
+enum class Solver { automatic, nlgs, active_set, accelerated, newton };
 
 enum class SubSteps {
   relative,  // motion of a pair relative to each other, in a sub-step, below `sub_step_motion` of the distance of their centres
@@ -40,6 +40,7 @@ struct StepReport {
   int sub_steps = 0;
   int sweeps = 0;                 // of all sub-steps
   long updates = 0;               // contacts visited in them
+  double solve_time = 0.0;        // wall time of the contact solver [s]
   long candidates = 0;            // contacts within the alert distance, mean over sub-steps
   long contacts = 0;              // of these load-bearing, mean over sub-steps
   double residual = 0.0;          // largest of the sub-steps [-]

@@ -24,6 +24,14 @@ struct Sums {  // over contacts
   }
 };
 
+inline double sum(double x) { return x; }
+inline double sum(const Lanes& x) { return (x[0] + x[1]) + (x[2] + x[3]); }
+
+template <class Real>
+Real positive_or_one(Real x) {
+  return x > 0.0 ? x : Real{} + 1.0;
+}
+
 template <int dim>
 Vec<dim> vector(const Vec<dim>& n, double p_n, const Tangent<dim>& p_t) {
   return p_n * n + tangent_vector(n, p_t);
@@ -85,7 +93,7 @@ template <Law law, int dim, class A, class C>
                                           double omega) {
   Slip<dim> u = slip<law, dim>(a, b, c.n);
   u.n += c.bias;
-  if (c.p.n == 0.0 && u.n >= 0.0) return {};  // open and stays open
+  if (c.p.n == 0.0 && u.n >= 0.0) return {};  // open and stays open; an extrapolated impulse may be negative
   if constexpr (law == Law::coulomb_restitution) u.t += *bias_t;
   const double rolling = 1.0 / (1.0 + spin_ratio);
   Impulse<dim> next;
@@ -113,8 +121,10 @@ Change<> error(const A& a, const Body<dim>& b, const C& c, const Tangent<dim>* b
 
 // visit(block) for every block, by the threads of a team: those of one colour at the same time.
 template <int dim, class Visit>
-void each_block(const Problem<dim>& problem, Visit&& visit) {
-  for (std::size_t colour = 0; colour + 1 < problem.colours.size(); ++colour) {
+void each_block(const Problem<dim>& problem, Visit&& visit, bool backwards = false) {
+  const int n_colours = static_cast<int>(problem.colours.size()) - 1;
+  for (int k = 0; k < n_colours; ++k) {
+    const int colour = backwards ? n_colours - 1 - k : k;
 #pragma omp for schedule(static)
     for (int b = problem.colours[colour]; b < problem.colours[colour + 1]; ++b) visit(b);
   }
@@ -123,6 +133,7 @@ void each_block(const Problem<dim>& problem, Visit&& visit) {
 // What a pass over the contacts does. Each lists the contacts that have not settled for the next.
 enum class Pass {
   all,        // update every contact
+  back,       // the same in the opposite order
   touched,    // those with a grain that listed contacts have moved; the others still solve what they solved before
   unsettled,  // those listed
   residual,   // measure the error of every contact
@@ -162,15 +173,63 @@ class Sweeper {
 
   // To be called by all threads of a team; ends with a barrier after which the sums hold.
   void pass(Pass what, double omega) {
-    each_block(p_, [&](int b) { sums_[b] = block(what, b, omega); });
+    if (what == Pass::back) {
 #pragma omp single
-    finish(what, omega);
+      wall_sums_ = walls(what, omega);
+    }
+    each_block(p_, [&](int b) { sums_[b] = block(what, b, omega); }, what == Pass::back);
+#pragma omp single
+    {
+      if (what != Pass::back) wall_sums_ = walls(what, omega);
+      add_up(what);
+    }
   }
 
-  // The same, by one thread: blocks are sorted by colour, so the result is the same.
+  // The same, by one thread: blocks are sorted by colour, so the result is the same. Not for Pass::back.
   void pass_alone(Pass what, double omega) {
     for (int b = 0; b < static_cast<int>(p_.blocks.size()); ++b) sums_[b] = block(what, b, omega);
-    finish(what, omega);
+    wall_sums_ = walls(what, omega);
+    add_up(what);
+  }
+
+  // Impulses and velocities go on by beta times the way p - p_0 they have come since the last call, p_0. To be called by all threads
+  // of a team. Afterwards resists(): whether sweeps have been pulling p back against that way from where they started, y,
+  //   (y - p) . W_nn (p - p_0) > 0.
+  void extrapolate(double beta) {
+    each_block(p_, [&](int b) {
+      Real against{};
+      for (int k = 0; k < s_.units[b]; ++k) against += go_on(contact(b, k), last_[unit_at(b, k)], start_[unit_at(b, k)], beta);
+      sums_[b].change = sum(against);
+    });
+#pragma omp for schedule(static)
+    for (int k = 0; k < static_cast<int>(p_.bodies.size()); ++k) go_on(p_.bodies[k], last_body_[k], beta);
+#pragma omp single
+    {
+      against_ = 0.0;
+      for (const Sums& s : sums_) against_ += s.change;
+      for (std::size_t k = 0; k < p_.wall_contacts.size(); ++k)
+        against_ += go_on(p_.wall_contacts[k], last_wall_contact_[k], start_wall_contact_[k], beta);
+      for (std::size_t w = 0; w < p_.walls.size(); ++w) {
+        const Vec<dim> v = p_.walls[w].v;
+        p_.walls[w].v += beta * (v - last_wall_[w]);
+        last_wall_[w] = v;
+      }
+    }
+  }
+  bool resists() const { return against_ > 0.0; }
+
+  // Where the first way starts: to be called by one thread before the first sweep.
+  void begin_extrapolation() {
+    const std::size_t n_units = wide ? s_.packs.size() : p_.contacts.size();
+    last_.resize(n_units), start_.resize(n_units);
+    for (std::size_t b = 0; b < p_.blocks.size(); ++b)
+      for (int k = 0; k < s_.units[b]; ++k) last_[unit_at(b, k)] = start_[unit_at(b, k)] = contact(b, k).p;
+    last_wall_contact_.resize(p_.wall_contacts.size());
+    for (std::size_t k = 0; k < p_.wall_contacts.size(); ++k) last_wall_contact_[k] = p_.wall_contacts[k].p;
+    start_wall_contact_ = last_wall_contact_;
+    last_body_.assign(p_.bodies.begin(), p_.bodies.end());
+    last_wall_.clear();
+    for (const Wall<dim>& wall : p_.walls) last_wall_.push_back(wall.v);
   }
 
   // Marks the grains that the listed contacts, or walls, will move until the next pass over those touched. One thread.
@@ -247,19 +306,28 @@ class Sweeper {
       return p_.contacts[p_.blocks[b].begin + k];
   }
 
-  // What one thread does at the end of a pass: contacts with walls, which share them, and the sums.
-  void finish(Pass what, double omega) {
-    total_ = {};
-    for (std::size_t k = 0; k < p_.wall_contacts.size(); ++k) {
+  std::size_t unit_at(std::size_t b, int k) const { return wide ? s_.first[b] + k : p_.blocks[b].begin + k; }
+
+  // Contacts with walls, which share them: one thread.
+  Sums walls(Pass what, double omega) {
+    Sums sums;
+    const std::size_t n = p_.wall_contacts.size();
+    for (std::size_t a = 0; a < n; ++a) {
+      const std::size_t k = what == Pass::back ? n - 1 - a : a;
       WallContact<dim>& c = p_.wall_contacts[k];
       const Tangent<dim>* bias_t = p_.wall_bias_t.empty() ? nullptr : &p_.wall_bias_t[k];
       if (what == Pass::residual)
-        total_ += error<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, bias_t);
+        sums += error<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, bias_t);
       else
-        total_ += update<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, bias_t, p_.spin_ratio, omega);
+        sums += update<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, bias_t, p_.spin_ratio, omega);
     }
+    return sums;
+  }
+
+  void add_up(Pass what) {
+    total_ = wall_sums_;
     for (const Sums& s : sums_) total_ += s;
-    if (what == Pass::all || what == Pass::residual) size_ = total_.size;
+    if (what == Pass::all || what == Pass::back || what == Pass::residual) size_ = total_.size;
     unsettled_ = unit * std::accumulate(s_.listed.begin(), s_.listed.end(), 0L);
     if (what == Pass::residual) return;
     ++sweeps_;
@@ -274,13 +342,12 @@ class Sweeper {
       s_.listed[b] = static_cast<int>(end - list);
       end = list;
     }
-    const bool all = what == Pass::all || what == Pass::residual;
+    const bool all = what == Pass::all || what == Pass::back || what == Pass::residual, back = what == Pass::back;
     const int n = all ? s_.units[b] : s_.listed[b];
-    using Real = std::conditional_t<wide, Lanes, double>;
     Change<Real> total;
     auto visit = [&](auto&& one) {
       for (int a = 0; a < n; ++a) {
-        const int k = all ? a : list[a];
+        const int k = back ? n - 1 - a : all ? a : list[a];
         const Change<Real> change = one(contact(b, k), k);
         total.change += change.change;
         total.size += change.size;
@@ -310,10 +377,36 @@ class Sweeper {
     return sums;
   }
 
+  // Returns (y - p) . W_nn (p - p_0); then p_0 becomes p, and both p and y the point further on.
+  template <class C, class I>
+  static auto go_on(C& c, I& last, I& start, double beta) {
+    const I p = c.p;
+    const auto way_n = p.n - last.n, to_start_n = start.n - p.n;
+    const typename I::T way_t = p.t - last.t, to_start_t = start.t - p.t;
+    const auto back = to_start_n * way_n + product(to_start_t, way_t);
+    last = p;
+    c.p.n += beta * way_n, c.p.t += beta * way_t;
+    start = c.p;
+    return back / positive_or_one(c.inv_w);  // empty lanes: 1/W = 0
+  }
+  static void go_on(Body<dim>& b, Body<dim>& last, double beta) {
+    const Body<dim> now = b;
+    b.v += beta * (now.v - last.v);
+    b.s += beta * (now.s - last.s);
+    last = now;
+  }
+
   Problem<dim>& p_;
   Scratch& s_;
   std::vector<Sums> sums_;
-  Sums total_;
+  Sums total_, wall_sums_;
+  using Real = std::conditional_t<wide, Lanes, double>;
+  using UnitImpulse = std::conditional_t<wide, Impulse<2, Lanes>, Impulse<dim>>;
+  std::vector<UnitImpulse> last_, start_;  // of extrapolate(): p_0 and y
+  std::vector<Impulse<dim>> last_wall_contact_, start_wall_contact_;
+  std::vector<Body<dim>> last_body_;
+  std::vector<Vec<dim>> last_wall_;
+  double against_ = 0.0;
   double size_ = 0.0;  // of the last pass over all
   double settled_energy_ = 0.0, settled_speed2_ = 0.0;
   int sweeps_ = 0;
@@ -325,17 +418,48 @@ constexpr double strongest_omega = 1.8;
 // Fewer contacts than that are swept sooner by one thread than several can meet at the ends of the colours.
 constexpr long worth_sharing = 2000;
 
-// Sweeps until the residual is below the tolerance. The change of the impulses in a sweep over all contacts tells when the
-// residual is worth its pass.
+// When the residual is worth its pass: the change of the impulses in a sweep over all contacts tells.
+class Watch {
+ public:
+  explicit Watch(const SolverSettings& settings) : settings_(settings), trial_(settings.tolerance), trial_worst_(2 * settings.worst) {}
+
+  bool worth_a_look(double change, double worst) {
+    change_ = change, change_worst_ = worst;
+    const bool promising = change <= trial_ && worst <= trial_worst_;
+    return promising || (change <= settings_.tolerance && worst <= 2 * settings_.worst && ++unchecked_ >= 5);
+  }
+
+  // Notes what the residual was found to be; returns whether that is good enough.
+  bool look(double residual, double worst, SolveReport& report) {
+    report.residual = residual, report.worst = worst;
+    report.converged = (residual <= settings_.tolerance && worst <= settings_.worst) ||
+                       worst <= settings_.rounding;  // contacts that only just touch: impulses of the size of their errors
+    auto lower = [](double trial, double seen, double wanted, double error) {
+      return error > wanted ? std::min(trial, seen) * std::clamp(0.7 * wanted / error, 0.1, 0.7) : trial;
+    };
+    trial_ = lower(trial_, change_, settings_.tolerance, residual);
+    trial_worst_ = lower(trial_worst_, change_worst_, settings_.worst, worst);
+    unchecked_ = 0;
+    return report.converged;
+  }
+
+ private:
+  const SolverSettings& settings_;
+  double trial_, trial_worst_;  // changes below which the residual is looked at
+  double change_ = 0.0, change_worst_ = 0.0;
+  int unchecked_ = 0;           // passes since the last look that may have been enough
+};
+
+// Sweeps until the residual is below the tolerance.
 template <Law law, int dim>
 SolveReport relax(Problem<dim>& problem, const SolverSettings& settings, bool active_set) {
   Sweeper<law, dim> sweeper(problem);
+  Watch watch(settings);
   SolveReport report;
   enum class Next { sweep, active, check, done } next = Next::sweep;
+  const Next sweep = active_set ? Next::active : Next::sweep;  // all but the first
   double omega = active_set ? settings.omega : 1.0;
-  double trial = settings.tolerance, trial_worst = 2 * settings.worst;  // changes below which the residual is looked at
-  double before = std::numeric_limits<double>::infinity(), before_worst = before;
-  int unchecked = 0;  // passes since the last look at the residual that may have been enough
+  double before = std::numeric_limits<double>::infinity();
   int slow = 0;
   const long contacts = std::accumulate(problem.count.begin(), problem.count.end(), 1L);
 #pragma omp parallel num_threads(problem.threads)
@@ -352,21 +476,8 @@ SolveReport relax(Problem<dim>& problem, const SolverSettings& settings, bool ac
 #pragma omp single
     {
       if (next == Next::check) {
-        report.residual = sweeper.relative();
-        report.worst = sweeper.worst();
-        report.converged = (report.residual <= settings.tolerance && report.worst <= settings.worst) ||
-                           report.worst <= settings.rounding;  // contacts that only just touch: impulses of the size of their errors
-        if (report.converged || sweeper.sweeps() >= settings.max_sweeps) {
-          next = Next::done;
-        } else {
-          auto lower = [](double trial, double seen, double wanted, double error) {
-            return error > wanted ? std::min(trial, seen) * std::clamp(0.7 * wanted / error, 0.1, 0.7) : trial;
-          };
-          trial = lower(trial, before, settings.tolerance, report.residual);
-          trial_worst = lower(trial_worst, before_worst, settings.worst, report.worst);
-          unchecked = 0;
-          next = active_set ? Next::active : Next::sweep;
-        }
+        const bool done = watch.look(sweeper.relative(), sweeper.worst(), report) || sweeper.sweeps() >= settings.max_sweeps;
+        next = done ? Next::done : sweep;
       } else {
         const double change = sweeper.relative();
         // Over-relaxation can cycle in dense states: three sweeps in a row that gain less than a fifth halve omega - 1.
@@ -374,12 +485,10 @@ SolveReport relax(Problem<dim>& problem, const SolverSettings& settings, bool ac
         // Where that does not help it was no cycle, but impulses that balance each other, as of a wedged grain, and fade slowly.
         if (active_set && slow >= (omega > 1.0 ? 3 : 10))
           omega = omega == 1.0 ? strongest_omega : (omega < 1.1 ? 1.0 : 1.0 + 0.5 * (omega - 1.0)), slow = 0;
-        before = change, before_worst = sweeper.worst();
+        before = change;
         // Settled: an equal share of the tolerance in the energy norm, and well below the error allowed to one contact.
         sweeper.settle(settings.tolerance * settings.tolerance * sweeper.size() / static_cast<double>(contacts), 0.3 * settings.worst);
-        const bool promising = change <= trial && before_worst <= trial_worst;
-        const bool worth_a_look = change <= settings.tolerance && before_worst <= 2 * settings.worst && ++unchecked >= 5;
-        next = promising || worth_a_look || sweeper.sweeps() >= settings.max_sweeps ? Next::check : (active_set ? Next::active : Next::sweep);
+        next = watch.worth_a_look(change, sweeper.worst()) || sweeper.sweeps() >= settings.max_sweeps ? Next::check : sweep;
       }
     }
   }
@@ -388,38 +497,84 @@ SolveReport relax(Problem<dim>& problem, const SolverSettings& settings, bool ac
   return report;
 }
 
-template <int dim>
-SolveReport relax_by_law(Problem<dim>& problem, const SolverSettings& settings, bool active_set) {
-  if (!problem.friction) return relax<Law::frictionless>(problem, settings, active_set);
-  if (problem.bias_t.empty() && problem.wall_bias_t.empty())
-    return relax<Law::coulomb>(problem, settings, active_set);
-  return relax<Law::coulomb_restitution>(problem, settings, active_set);
+// A sweep and one in the opposite order, then a step further the way the two have taken.
+template <Law law, int dim>
+SolveReport accelerate(Problem<dim>& problem, const SolverSettings& settings) {
+  Sweeper<law, dim> sweeper(problem);
+  sweeper.begin_extrapolation();
+  Watch watch(settings);
+  SolveReport report;
+  Restart restart;
+  double beta = 0.0;
+  bool look = false, done = false;
+#pragma omp parallel num_threads(problem.threads)
+  while (true) {
+    sweeper.pass(Pass::all, 1.0);
+    sweeper.pass(Pass::back, 1.0);
+#pragma omp single
+    {
+      const bool last = sweeper.sweeps() >= settings.max_sweeps;
+      beta = restart.weigh(sweeper.relative());
+      look = watch.worth_a_look(sweeper.relative(), sweeper.worst()) || last;
+      done = last;
+    }
+    if (look) {
+      sweeper.pass(Pass::residual, 1.0);
+#pragma omp single
+      done |= watch.look(sweeper.relative(), sweeper.worst(), report);
+    }
+    if (done) break;
+    sweeper.extrapolate(beta);
+#pragma omp single
+    restart.resisted(sweeper.resists());
+  }
+  report.sweeps = sweeper.sweeps();
+  report.updates = sweeper.updates();
+  return report;
+}
+
+// solve(law) with the simplest law that the problem needs.
+template <int dim, class Solve>
+SolveReport by_law(const Problem<dim>& problem, Solve&& solve) {
+  using enum Law;
+  if (!problem.friction) return solve(std::integral_constant<Law, frictionless>());
+  if (problem.bias_t.empty() && problem.wall_bias_t.empty()) return solve(std::integral_constant<Law, coulomb>());
+  return solve(std::integral_constant<Law, coulomb_restitution>());
 }
 
 }  // namespace
 
 template <int dim>
 SolveReport solve_nlgs(Problem<dim>& problem, const SolverSettings& settings) {
-  return relax_by_law(problem, settings, false);
+  return by_law(problem, [&](auto law) { return relax<law>(problem, settings, false); });
 }
 
 template <int dim>
 SolveReport solve_active_set(Problem<dim>& problem, const SolverSettings& settings) {
-  return relax_by_law(problem, settings, true);
+  return by_law(problem, [&](auto law) { return relax<law>(problem, settings, true); });
 }
 
+template <int dim>
+SolveReport solve_accelerated(Problem<dim>& problem, const SolverSettings& settings) {
+  return by_law(problem, [&](auto law) { return accelerate<law>(problem, settings); });
+}
+
+// What the active set has not solved by then reaches over many layers.
+constexpr int local_sweeps = 300;
 // Factorising W of more contacts than that takes longer than any number of sweeps that a step may make, and gigabytes.
 constexpr std::size_t newton_contacts = 100000;
 
 template <int dim>
 SolveReport solve_auto(Problem<dim>& problem, const SolverSettings& settings) {
-  SolveReport report = solve_active_set(problem, settings);
+  SolverSettings few = settings;
+  few.max_sweeps = std::min(settings.max_sweeps, local_sweeps);
+  few.max_newton = std::max(settings.max_newton / 5, 1);  // near the solution it converges soon or cycles
+  SolveReport report = solve_active_set(problem, few);
   auto go_on = [&](const SolveReport& more) {
     report = {report.sweeps + more.sweeps, report.updates + more.updates, more.residual, more.worst, more.converged};
   };
   const std::size_t contacts = std::accumulate(problem.count.begin(), problem.count.end(), problem.wall_contacts.size());
-  SolverSettings few = settings;
-  few.max_newton = std::max(settings.max_newton / 5, 1);  // near the solution it converges soon or cycles
+  if (!report.converged && settings.max_sweeps > local_sweeps) go_on(solve_accelerated(problem, settings));
   if (!report.converged && contacts <= newton_contacts) go_on(solve_newton(problem, few));
   if (!report.converged) go_on(solve_nlgs(problem, settings));
   return report;
@@ -592,6 +747,8 @@ template SolveReport solve_nlgs(Problem<2>&, const SolverSettings&);
 template SolveReport solve_nlgs(Problem<3>&, const SolverSettings&);
 template SolveReport solve_active_set(Problem<2>&, const SolverSettings&);
 template SolveReport solve_active_set(Problem<3>&, const SolverSettings&);
+template SolveReport solve_accelerated(Problem<2>&, const SolverSettings&);
+template SolveReport solve_accelerated(Problem<3>&, const SolverSettings&);
 template SolveReport solve_auto(Problem<2>&, const SolverSettings&);
 template SolveReport solve_auto(Problem<3>&, const SolverSettings&);
 template SolveReport solve_newton(Problem<2>&, const SolverSettings&);

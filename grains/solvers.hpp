@@ -74,11 +74,17 @@ SolveReport solve_nlgs(Problem<dim>& problem, const SolverSettings& settings);
 template <int dim>
 SolveReport solve_active_set(Problem<dim>& problem, const SolverSettings& settings);
 
+// Symmetric Gauss-Seidel (a sweep to and fro: X. Li, D. Sun, K.-C. Toh, Math. Program. 155 (2016)) with Nesterov's extrapolation and
+// restarts (contact.hpp): sweeps grow as the height of the scene, not as its square.
+template <int dim>
+SolveReport solve_accelerated(Problem<dim>& problem, const SolverSettings& settings);
+
 // Newton's method on the Delassus operator written out (delassus.hpp): few iterations however tall the scene, each a factorisation.
 template <int dim>
 SolveReport solve_newton(Problem<dim>& problem, const SolverSettings& settings);
 
-// solve_active_set; should it run out of sweeps, solve_newton, then solve_nlgs.
+// solve_active_set; what takes more than some hundred of its sweeps by solve_accelerated; should that run out of sweeps, solve_newton,
+// then solve_nlgs.
 template <int dim>
 SolveReport solve_auto(Problem<dim>& problem, const SolverSettings& settings);
 

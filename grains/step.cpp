@@ -63,7 +63,9 @@ StepReport<dim> Simulation<dim>::step(double dt) {
 
     accelerate(h);
     find_contacts(h, alert(motion.speed), alert(motion.wall_speed));
+    const auto solving = std::chrono::steady_clock::now();
     const SolveReport solved = solve_contacts(h);
+    report.solve_time += std::chrono::duration<double>(std::chrono::steady_clock::now() - solving).count();
     contacts_current_ = true;
     account(h, report);
     move(h);
@@ -417,6 +419,7 @@ SolveReport Simulation<dim>::solve_contacts(double h) {
     if (settings.solver == Solver::nlgs) return solve_nlgs(p, limits);
     if (settings.solver == Solver::newton) return solve_newton(p, limits);
     if (settings.solver == Solver::active_set) return solve_active_set(p, limits);
+    if (settings.solver == Solver::accelerated) return solve_accelerated(p, limits);
     return solve_auto(p, limits);
   };
   warm_start(problem);

@@ -97,7 +97,7 @@ struct WideSlip {
     if constexpr (law != Law::frictionless) t = c.n_x * u_y - c.n_y * u_x - (a.c + b.c);
     if constexpr (law == Law::coulomb_restitution) t += *bias_t;
   }
-  bool open(const Pack& c) const { return !any((c.p.n > 0.0) | (n < 0.0)); }  // and stays open
+  bool open(const Pack& c) const { return !any((c.p.n != 0.0) | (n < 0.0)); }  // and stays open
 };
 
 template <Law law>

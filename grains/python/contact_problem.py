@@ -22,7 +22,7 @@ class Solution:
 
     r: np.ndarray  # impulses (n,)
     u: np.ndarray  # relative velocities W r + q (n,)
-    solver: str  # that made the last iterations: "nlgs" or "newton"
+    solver: str  # that made the last iterations: "nlgs", "accelerated" or "newton"
     iterations: int  # sweeps and Newton iterations
     error: float  # of r, see ContactProblem.error
     converged: bool
@@ -104,8 +104,9 @@ class ContactProblem:
         Parameters
         ----------
         solver : str
-            "nlgs": nonlinear Gauss-Seidel. "newton": semismooth Newton with proximal points; it also solves systems with more contacts
-            than freedoms, at the cost of a factorisation of W each iteration. "auto": sweeps while they promise to be cheaper, then Newton.
+            "nlgs": nonlinear Gauss-Seidel, the reference. "accelerated": the same to and fro with Nesterov's extrapolation. "newton":
+            semismooth Newton with proximal points; it also solves systems with more contacts than freedoms, at the cost of a factorisation
+            of W each iteration. "auto": "accelerated" while it promises to be cheaper, then "newton".
         tolerance : float
             On `error` [-].
         max_iterations : int

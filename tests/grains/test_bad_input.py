@@ -145,7 +145,7 @@ RULES = [
     (lambda s: setattr(s.sim, "omega", 2.0), "Simulation: omega must be in [1, 2), got 2"),
     (lambda s: setattr(s.sim, "sub_step_motion", NAN), "Simulation: sub_step_motion must be in (0, 0.5], got nan"),
     (lambda s: setattr(s.sim, "rest_speed", INF), "Simulation: rest_speed must be >= 0 m/s and finite, got inf"),
-    (lambda s: setattr(s.sim, "solver", "lu"), "Simulation: solver must be one of 'auto', 'nlgs', 'active_set', 'newton', got 'lu'"),
+    (lambda s: setattr(s.sim, "solver", "lu"), "Simulation: solver must be one of 'auto', 'nlgs', 'active_set', 'accelerated', 'newton', got 'lu'"),
     (lambda s: setattr(s.sim, "sub_step_rule", ""), "Simulation: sub_step_rule must be 'relative' or 'absolute', got ''"),
     (lambda s: grains.Simulation(dim=4), "Simulation: dim must be 2 or 3, got 4"),
     (lambda s: grains.Simulation(s.dim, period=(0.1,)), "Simulation: period needs one entry per axis"),

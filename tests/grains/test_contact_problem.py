@@ -45,7 +45,7 @@ def test_one_contact_open_sticking_and_sliding_in_closed_form():
     assert found.r == pytest.approx([1.25, -0.625]) and found.u == pytest.approx([0, 3 + 0.5 - 1.25])
     # 3D: the sliding velocity is opposite to friction, and the normal one zero
     W = np.array([[1, 0.2, -0.1], [0.2, 2, 0.3], [-0.1, 0.3, 1.5]])
-    for solver in ("auto", "nlgs", "newton"):
+    for solver in ("auto", "nlgs", "accelerated", "newton"):
         found = one(3, (-1.0, 2.0, -1.0), 0.5, W).solve(solver, tolerance=1e-12)
         t, u_t = found.r[1:], found.u[1:]
         assert np.linalg.norm(t) == pytest.approx(0.5 * found.r[0]) and found.u[0] == pytest.approx(0, abs=1e-11)
@@ -148,7 +148,7 @@ def test_a_file_that_cannot_be_used_says_why(tmp_path, how, says):
     (lambda: one(W=[[np.nan, 0], [0, 1]]), "W must be finite"),
     (lambda: one(friction=-0.1), "friction must be >= 0, got -0.1"),
     (lambda: one(W=np.diag([0.0, 1.0])), "W_nn of every contact must be > 0"),
-    (lambda: one().solve("lu"), "solver must be 'auto', 'nlgs' or 'newton', got 'lu'"),
+    (lambda: one().solve("lu"), "solver must be 'auto', 'nlgs', 'accelerated' or 'newton', got 'lu'"),
     (lambda: one().solve(tolerance=0), "tolerance must be > 0"),
     (lambda: one().solve(max_iterations=0), "max_iterations must be >= 1"),
     (lambda: one().solve(start=np.zeros(5)), "solve: r must be 2 finite numbers"),
@@ -204,7 +204,7 @@ def test_a_step_leaves_its_problem_and_solution(tmp_path):
     grains.write_fclib(tmp_path / "step.hdf5", scaled)
     again = grains.read_fclib(tmp_path / "step.hdf5")
     assert again.title == "20 layers" and again.error(r / impulse) < 1e-8
-    for solver in ("auto", "nlgs", "newton"):
+    for solver in ("auto", "nlgs", "accelerated", "newton"):
         found = again.solve(solver, tolerance=1e-10)
         np.testing.assert_allclose(impulse * found.r, r, atol=1e-6 * r.max())
 

@@ -68,7 +68,7 @@ TYPED_TEST(Delassus, every_solver_finds_the_same_motion) {
       sim.step(1e-3);
       const std::vector<char> state = sim.state();
       std::vector<Vec<dim>> first;
-      for (Solver solver : {Solver::nlgs, Solver::active_set, Solver::newton, Solver::automatic}) {
+      for (Solver solver : {Solver::nlgs, Solver::active_set, Solver::accelerated, Solver::newton, Solver::automatic}) {
         sim.restore(state);
         sim.settings.solver = solver;
         EXPECT_EQ(sim.step(1e-4).unconverged, 0) << static_cast<int>(solver);
@@ -89,12 +89,29 @@ TYPED_TEST(Delassus, all_solvers_of_problems_written_out_agree_on_the_velocities
   const Eigen::VectorXd u = contact_velocity(problem, found);
   const DelassusSettings settings{.norm = Norm::energy, .tolerance = 1e-9, .max_iterations = 200000};
   using Solve = DelassusReport (*)(const DelassusProblem<dim>&, Eigen::VectorXd&, const DelassusSettings&);
-  for (Solve solve : std::initializer_list<Solve>{solve_nlgs<dim>, solve_newton<dim>, solve_auto<dim>}) {
+  for (Solve solve : std::initializer_list<Solve>{solve_nlgs<dim>, solve_accelerated<dim>, solve_newton<dim>, solve_auto<dim>}) {
     Eigen::VectorXd r = Eigen::VectorXd::Zero(found.size());
     const DelassusReport report = solve(problem, r, settings);
     EXPECT_TRUE(report.converged);
     EXPECT_LT((contact_velocity(problem, r) - u).norm(), 1e-6 * u.norm());
   }
+}
+
+// Sweeps grow with the height of a pile when accelerated, with its square otherwise; in a wide pile of touching grains too.
+TYPED_TEST(Delassus, accelerated_sweeps_grow_with_the_height) {
+  constexpr int dim = TypeParam::value;
+  auto sweeps = [](Solver solver, int layers) {
+    auto sim = column<dim>(layers);
+    sim.settings.solver = solver;
+    sim.settings.solve.tolerance = 1e-6 / (layers * layers);  // the same error of the forces
+    sim.settings.solve.max_sweeps = 1000000;
+    const int made = sim.step(1e-3).sweeps;
+    for (double force : sim.contacts().force_normal) EXPECT_GT(force, 0.99 * mass<dim>(1e-3) * g);
+    return made;
+  };
+  EXPECT_GT(sweeps(Solver::nlgs, 80), 10 * sweeps(Solver::nlgs, 20));
+  EXPECT_LT(sweeps(Solver::accelerated, 80), 7 * sweeps(Solver::accelerated, 20));
+  EXPECT_LT(10 * sweeps(Solver::accelerated, 80), sweeps(Solver::nlgs, 80));
 }
 
 // Sweeps carry weight by one layer at a time, a Newton step through all of them.
