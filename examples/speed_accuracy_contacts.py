@@ -1,44 +1,57 @@
-"""Contact solvers: wall time against error, on third-party problems and on columns of grains.
+"""Contact solvers: wall time against error, on third-party problems, columns of grains, states of a flow, and whole runs.
 
     ./run examples/speed_accuracy_contacts.py --out out/speed_accuracy_contacts
 
 Flags
-    --parts NAME ...    problems, columns, estimate (all)
+    --parts NAME ...    problems, columns, estimate, states, runs (all)
     --repeat N          times are medians of so many solves (11)
     --out DIR           results.json, tables.md and figures (out/speed_accuracy_contacts)
     --quick             three solves, columns of up to 40 layers, without Siconos
 
-problems: the eight files of tests/data/frictional_contact from r = 0, to 1e-4 and 1e-8, by nlgs, newton and auto, one thread, the solver's call
+problems: the eight files of tests/data/frictional_contact from r = 0, to 1e-4 and 1e-8, by nlgs, accelerated, newton and auto, one thread, the solver's call
     only; by Siconos' NSGS too where Debian's python3-siconos is installed. Figure profile.png: the share of problems that a solver
     solves within a factor of the time of the fastest (Dolan and More, Math. Program. 91 (2002)).
 columns: single columns of discs from zero impulses until every contact force is within 1e-4 of the weight above it.
 estimate: the global error estimate against the true error, over sweeps of NLGS on such columns, single and four wide (hexagonal).
+states: one sub-step of plane Couette flow (dry_couette.py: collisional, size ratio 1 at 20 /s, and quasi-static, 1.5 at 1 /s) by every solver of
+    scenes at tolerances from 0.1 to 1e-8, warm; errors in the energy norm against the solver's own solution at 1e-9.
+runs: whole runs over tolerance, sub-steps and time step, beside LAMMPS where it is installed (whole_runs.py); about half an hour. Runs that
+    --out/runs holds are not made again.
 
 results.json, flat; lists run over the cases of a part:
     problems problem_solvers problem_tolerances problem_errors problem_times   time [s], null: not solved in 20 000 iterations
     column_solvers column_layers column_times [s] column_iterations   null: not within 1e-4 at any tolerance down to 1e-10
     column_exponent_SOLVER              slope of log time over log layers, from 40 layers on [-]
+    state_names state_solvers state_tolerances state_residuals state_errors state_times [s] state_sweeps state_updates state_converged
+    state_contacts_NAME  state_gain_NAME   time of nlgs over that of auto at a residual of 1e-4, interpolated [-]
+    run_names run_mu run_mu_err run_phi run_phi_err run_overlap run_overlap_max [d] run_seconds (per simulated second) run_unconverged run_sub_steps
     estimate_layers estimate_width estimate_sweeps estimate_residuals estimate_true estimate_estimates estimate_ratio_min estimate_ratio_max
 """
 
 import sys
 import tempfile
 import time
+import types
 from pathlib import Path
 
 import numpy as np
 
+import dry_couette
+import whole_runs
 from quicksand import grains, study
 
 DATA = Path(__file__).parents[1] / "tests" / "data" / "frictional_contact"
 GRAVITY, RADIUS, DENSITY, DT = 9.81, 1e-3, 2500.0, 1e-3
 MOST = 20000  # iterations
-COLOURS = {"nlgs": "#1f5fa8", "newton": "#c2452d", "auto": "#222222", "active_set": "#2e7d4f", "siconos": "#8a5a00"}
+COLOURS = {"nlgs": "#1f5fa8", "newton": "#c2452d", "auto": "#222222", "active_set": "#2e7d4f", "accelerated": "#7a4fa3", "siconos": "#8a5a00"}
+SCENE_SOLVERS = ("nlgs", "active_set", "accelerated", "newton", "auto")
+PARTS = ("problems", "columns", "estimate", "states", "runs")
+STATES = {"collisional": (1.0, 20.0), "quasi-static": (1.5, 1.0)}  # size ratio, rate [1/s]
 
 
 def parse_flags():
     parser = study.CommandLine(__doc__)
-    parser.add_argument("--parts", nargs="+", choices=("problems", "columns", "estimate"), default=("problems", "columns", "estimate"))
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--repeat", type=study.whole(at_least=1))
     parser.add_argument("--out", type=Path, default=Path("out/speed_accuracy_contacts"))
     parser.add_argument("--quick", action="store_true")
@@ -96,7 +109,7 @@ def measure_problems(flags):
                 return (found.r if found.converged else None), found.wall_time
             return solve
 
-        solvers = {name: ours(name) for name in ("nlgs", "newton", "auto")}
+        solvers = {name: ours(name) for name in ("nlgs", "accelerated", "newton", "auto")}
         with tempfile.TemporaryDirectory() as folder:
             if not flags.quick and (theirs := siconos_nsgs(problem, Path(folder))):
                 solvers["siconos"] = theirs
@@ -149,7 +162,7 @@ def time_of_column(layers, solver, repeat):
 def measure_columns(flags):
     layers = [10, 20, 40] if flags.quick else [10, 20, 40, 80, 160, 320]
     results = {"column_solvers": [], "column_layers": [], "column_times": [], "column_iterations": []}
-    for solver in ("nlgs", "active_set", "newton"):
+    for solver in SCENE_SOLVERS:
         times = []
         for n in layers:
             if solver == "nlgs" and n > 160:
@@ -176,6 +189,54 @@ def measure_estimate(flags):
     results = {f"estimate_{name}": list(values) for name, values in zip(names, zip(*rows))}
     ratio = [row[5] / row[4] for row in rows if row[4] > 1e-6]
     return results | {"estimate_ratio_min": min(ratio), "estimate_ratio_max": max(ratio)}
+
+
+def developed(size_ratio, rate, quick):
+    """State of a flow after 2 s, and the sub-step that it takes [s]."""
+    size = {"height": 0.03, "width": 0.06} if quick else {"height": 0.1, "width": 0.2}
+    scene = dry_couette.Scene(types.SimpleNamespace(seed=0, size_ratio=size_ratio, fixed_height=False, rough_walls=False, rate=rate, pressure=5.0,
+                                                    threads=1, tolerance=None, friction=0.4, wall_friction=1.0, t_end=10.0, dt=DT, **size))
+    for _ in range(300 if quick else 2000):
+        report = scene.sim.step(DT)
+    return scene.sim, scene.sim.state(), DT / report.sub_steps
+
+
+def one_step(sim, state, h, solver, tolerance, repeat):
+    """Median solver time [s] of one sub-step from a state, its report, its contact problem and the impulses found."""
+    seconds = []
+    while len(seconds) < repeat and sum(seconds) < 2.0:
+        sim.restore(state)
+        sim.solver, sim.tolerance, sim.max_sweeps = solver, tolerance, 50000
+        report = sim.step(h)
+        seconds.append(report.solve_time)
+    return float(np.median(seconds)), report, *grains.contact_problem(sim)
+
+
+def measure_states(flags):
+    rows, results = [], {}
+    for name, (size_ratio, rate) in STATES.items():
+        sim, state, h = developed(size_ratio, rate, flags.quick)
+        for solver in SCENE_SOLVERS:
+            *_, problem, exact = one_step(sim, state, h, solver, 1e-9, 1)
+            size = np.sqrt(exact @ (problem.W @ exact))
+            for tolerance in 10.0 ** np.arange(-1, -4 if flags.quick else -8.5, -1 if flags.quick else -0.5):
+                seconds, report, _, r = one_step(sim, state, h, solver, tolerance, flags.repeat)
+                error = np.sqrt(max((r - exact) @ (problem.W @ (r - exact)), 0.0)) / size
+                rows.append((name, solver, tolerance, report.residual, float(error), seconds, report.sweeps, report.updates, report.unconverged == 0))
+        results[f"state_contacts_{name}"] = problem.contacts
+    results |= dict(zip((f"state_{x}" for x in ("names", "solvers", "tolerances", "residuals", "errors", "times", "sweeps", "updates", "converged")),
+                        map(list, zip(*rows))))
+    for name in STATES:
+        nlgs, auto = (time_at(results, name, solver, 1e-2 if flags.quick else 1e-4) for solver in ("nlgs", "auto"))
+        results[f"state_gain_{name}"] = nlgs / auto
+    return results
+
+
+def time_at(results, name, solver, residual):
+    """Seconds to a residual, between those measured."""
+    rows = [(r, t) for n, s, r, t in zip(*(results[f"state_{x}"] for x in ("names", "solvers", "residuals", "times"))) if (n, s) == (name, solver)]
+    r, t = np.log(np.array(sorted(rows)).T)
+    return float(np.exp(np.interp(np.log(residual), r, t)))
 
 
 def profile(results, tolerance):
@@ -205,6 +266,12 @@ def tables(results):
         lines += ["", "NLGS stopped early", "", "| layers | width | sweeps | residual | true error | estimate |", "|---" * 6 + "|"]
         lines += [f"| {n} | {w} | {k} | {r:.1e} | {true:.3e} | {e:.3e} |" for n, w, k, r, true, e in
                   zip(*(results[f"estimate_{k}"] for k in ("layers", "width", "sweeps", "residuals", "true", "estimates")))]
+    if "state_names" in results:
+        lines += ["", "One sub-step of a flow, warm", "", "| state | solver | tolerance | residual | error | time [ms] | sweeps | ns per contact update |", "|---" * 8 + "|"]
+        lines += [f"| {n} | {s} | {tolerance:.1e} | {r:.1e} | {e:.1e} | {1e3 * t:.3g} | {sweeps} | {1e9 * t / updates if updates else 0:.2f} |" for n, s, tolerance, r, e, t, sweeps, updates in
+                  zip(*(results[f"state_{k}"] for k in ("names", "solvers", "tolerances", "residuals", "errors", "times", "sweeps", "updates")))]
+    if "run_names" in results:
+        lines += whole_runs.table(results)
     return "\n".join(lines) + "\n"
 
 
@@ -223,14 +290,24 @@ def plot(out, results):
         study.plot_lines(out / "estimate.png", "true error [-]", "what is reported [-]", [
             (f"{layers:g} layers", [(label, colour, true[chosen], value[chosen]) for label, colour, value in
                                     (("residual", COLOURS["nlgs"], residual), ("global error", COLOURS["newton"], estimate))])
-            for layers in dict.fromkeys(n) for chosen in [(n == layers) & (true > 1e-9)]], markers_only=True)
+            for layers in dict.fromkeys(n) for chosen in [(n == layers) & (true > 1e-9)]], points=True, diagonal=True)
+    if "state_names" in results:
+        names, solvers = (np.array(results[f"state_{k}"]) for k in ("names", "solvers"))
+        times = np.array(results["state_times"], float)
+        for kind in ("residual", "error"):
+            value = np.array(results[f"state_{kind}s"], float)
+            study.plot_lines(out / f"states_{kind}.png", "time of the solver [s]", f"{kind} [-]", [
+                (name, [(s, COLOURS[s], times[chosen], value[chosen]) for s in SCENE_SOLVERS for chosen in [(names == name) & (solvers == s)]]) for name in STATES])
+    if "run_names" in results:
+        whole_runs.plot(out / "runs.png", results)
 
 
 def main():
     flags = parse_flags()
     results = {}
     for part in flags.parts:
-        results |= {"problems": measure_problems, "columns": measure_columns, "estimate": measure_estimate}[part](flags)
+        results |= {"problems": measure_problems, "columns": measure_columns, "estimate": measure_estimate, "states": measure_states,
+                    "runs": whole_runs.measure}[part](flags)
     study.write_results(flags.out / "results.json", results)
     text = tables(results)
     (flags.out / "tables.md").write_text(text)

@@ -371,7 +371,7 @@ void bind(py::module_& m, const char* suffix) {
                             py::cpp_function(set, py::name(name), py::is_method(simulation)), doc);
   };
   setting("tolerance", [](Settings& s) -> double& { return s.solve.tolerance; },
-          "of every sub-step, on the residual [-]; no contact may be wrong by more than tolerance/20 mean diameters");
+          "of every sub-step, on the residual [-]; no contact may be wrong by more than 6 % of the tolerance in mean diameters");
   setting("max_sweeps", [](Settings& s) -> int& { return s.solve.max_sweeps; },
           "before the fallback");
   setting("omega", [](Settings& s) -> double& { return s.solve.omega; },

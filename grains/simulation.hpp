@@ -173,7 +173,8 @@ class Simulation {
   struct Pace {  // seconds per contact update, with one thread and with all, as measured last
     double seconds[2] = {0.0, 0.0};
     int samples[2] = {0, 0};
-    int steps = 0;
+    int shared = 1;           // what makes the steps: 1, all
+    int left = 0, wait = 200; // steps to the next trial of the other, and from that to the one after it
   } pace_;
   double mean_radius_ = 0.0, max_radius_ = 0.0, acceleration_ = 0.0;
   double wall_mass_ = 0.0;  // of load-driven walls whose mass nobody gave: a tenth of the grains' [kg]

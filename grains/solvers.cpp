@@ -152,19 +152,23 @@ class Sweeper {
     s_.listed.assign(n_blocks, 0);
     s_.units.assign(problem.count.begin(), problem.count.end());
     s_.touched.assign(problem.bodies.size(), -1);
+    wall_list_.resize(problem.wall_contacts.size());
     if constexpr (wide) pack();
   }
 
   // Writes the impulses back to where they came from.
   ~Sweeper() {
-    if constexpr (wide)
-      for (std::size_t b = 0; b < p_.blocks.size(); ++b)
+    if constexpr (wide) {
+#pragma omp parallel num_threads(p_.threads)
+      each_block(p_, [&](int b) {
         for (int k = 0; k < s_.units[b]; ++k)
           for (int lane = 0; lane < 4; ++lane)
             if (const int slot = s_.slots[p_.blocks[b].begin + k][lane]; slot >= 0) {
               const Pack& pack = s_.packs[s_.first[b] + k];
               p_.contacts[slot].p = {pack.p.n[lane], pack.p.t[lane]};
             }
+      });
+    }
   }
 
   // Contacts whose impulse changed by less than this are left out until a grain of theirs is touched:
@@ -311,16 +315,21 @@ class Sweeper {
   // Contacts with walls, which share them: one thread.
   Sums walls(Pass what, double omega) {
     Sums sums;
-    const std::size_t n = p_.wall_contacts.size();
-    for (std::size_t a = 0; a < n; ++a) {
-      const std::size_t k = what == Pass::back ? n - 1 - a : a;
+    const bool listed = what == Pass::unsettled;
+    const int n = listed ? n_wall_listed_ : static_cast<int>(p_.wall_contacts.size());
+    n_wall_listed_ = 0;
+    for (int a = 0; a < n; ++a) {
+      const int k = what == Pass::back ? n - 1 - a : listed ? wall_list_[a] : a;
       WallContact<dim>& c = p_.wall_contacts[k];
       const Tangent<dim>* bias_t = p_.wall_bias_t.empty() ? nullptr : &p_.wall_bias_t[k];
-      if (what == Pass::residual)
-        sums += error<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, bias_t);
-      else
-        sums += update<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, bias_t, p_.spin_ratio, omega);
+      const Change<> change = what == Pass::residual
+                                  ? error<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, bias_t)
+                                  : update<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, bias_t, p_.spin_ratio, omega);
+      sums += change;
+      wall_list_[n_wall_listed_] = k;
+      n_wall_listed_ += change.change > settled_energy_ || change.speed2 > settled_speed2_;
     }
+    sums.updates = n;
     return sums;
   }
 
@@ -328,10 +337,10 @@ class Sweeper {
     total_ = wall_sums_;
     for (const Sums& s : sums_) total_ += s;
     if (what == Pass::all || what == Pass::back || what == Pass::residual) size_ = total_.size;
-    unsettled_ = unit * std::accumulate(s_.listed.begin(), s_.listed.end(), 0L);
+    unsettled_ = unit * std::accumulate(s_.listed.begin(), s_.listed.end(), 0L) + n_wall_listed_;
     if (what == Pass::residual) return;
     ++sweeps_;
-    updates_ += unit * total_.updates + static_cast<long>(p_.wall_contacts.size());
+    updates_ += unit * (total_.updates - wall_sums_.updates) + wall_sums_.updates;
   }
 
   Sums block(Pass what, int b, double omega) {
@@ -400,6 +409,8 @@ class Sweeper {
   Scratch& s_;
   std::vector<Sums> sums_;
   Sums total_, wall_sums_;
+  std::vector<int> wall_list_;  // wall contacts that have not settled
+  int n_wall_listed_ = 0;
   using Real = std::conditional_t<wide, Lanes, double>;
   using UnitImpulse = std::conditional_t<wide, Impulse<2, Lanes>, Impulse<dim>>;
   std::vector<UnitImpulse> last_, start_;  // of extrapolate(): p_0 and y

@@ -22,11 +22,11 @@ constexpr double skin = 1.3;
 
 // A sub-step has converged when its residual is below the tolerance and no single contact's error, as an overlap h W_nn |e|, is above
 // this share of the tolerance in mean diameters: the overlaps of a flow stay at about twice this bound, and a global norm hides them.
-constexpr double overlap_share = 0.03;
+constexpr double overlap_share = 0.06;
 
 // Overlaps above this share of the tolerance, in mean diameters, are taken back: the errors of a contact that lasts add up.
-constexpr double repair_above = 0.06;
-constexpr double repaired = 0.5;  // of the excess, in a sub-step
+constexpr double repair_above = 0.03;
+constexpr double repaired = 1.0;  // of the excess, in a sub-step
 
 }  // namespace
 
@@ -106,16 +106,25 @@ StepReport<dim> Simulation<dim>::step(double dt) {
   return report;
 }
 
-// Threads that other work keeps waiting are slower than one alone, by orders of magnitude on a busy machine. Results do not depend on
-// their number, so every 200 steps a few are made both ways, and the faster way makes the rest.
+// Threads that other work keeps waiting are slower than one alone, by a factor of hundreds on a busy machine. Results do not depend on
+// their number, so now and then a few steps are made the other way, and the faster way makes the rest. A trial that goes badly ends
+// at once, and the longer nothing changes, the rarer trials are.
 template <int dim>
 int Simulation<dim>::choose_threads() {
   const int most = std::clamp(grains_.size() / 1000, 1, settings.threads);  // fewer grains are not worth a second thread
   if (most == 1) return 1;
-  if (pace_.steps++ % 200 == 0) pace_.seconds[0] = pace_.seconds[1] = 0.0, pace_.samples[0] = pace_.samples[1] = 0;
-  for (int way : {1, 0})
-    if (pace_.samples[way] < 3) return way ? most : 1;
-  return pace_.seconds[1] / pace_.samples[1] <= pace_.seconds[0] / pace_.samples[0] ? most : 1;
+  if (pace_.left-- <= 0) {
+    pace_.seconds[0] = pace_.seconds[1] = 0.0, pace_.samples[0] = pace_.samples[1] = 0;
+    pace_.left = pace_.wait;
+    pace_.wait = std::min(2 * pace_.wait, 5000);
+  }
+  const auto pace = [&](int way) { return pace_.seconds[way] / pace_.samples[way]; };
+  const int other = !pace_.shared;
+  if (pace_.samples[pace_.shared] < 3) return pace_.shared ? most : 1;
+  const bool bad = pace_.samples[other] > 0 && pace(other) > 3 * pace(pace_.shared);
+  if (pace_.samples[other] < 3 && !bad) return other ? most : 1;
+  if (pace(other) < pace(pace_.shared)) pace_.shared = other, pace_.wait = 200;
+  return pace_.shared ? most : 1;
 }
 
 // Checks of the scene that adding things one by one cannot make, and what depends on the scene but not on the sub-step.

@@ -227,7 +227,7 @@ def plot_errors(path, iterations, errors, tolerance):
 
 
 @_styled
-def plot_lines(path, x_label, y_label, panels, scales=("log", "log"), steps=False, markers_only=False):
+def plot_lines(path, x_label, y_label, panels, scales=("log", "log"), steps=False, points=False, diagonal=False):
     """Curves side by side, panels share their axes.
 
     Parameters
@@ -240,15 +240,17 @@ def plot_lines(path, x_label, y_label, panels, scales=("log", "log"), steps=Fals
         Of matplotlib's axes.
     steps : bool
         y keeps its value until the next x.
-    markers_only : bool
-        Points, and the line y = x.
+    points : bool
+        Points without lines.
+    diagonal : bool
+        The line y = x.
     """
     figure, axes = _figure(1, len(panels), (1.5 + 3.5 * len(panels), 3.8), sharex=True, sharey=True, squeeze=False)
     for axis, (title, curves) in zip(axes[0], panels):
         for label, colour, x, y in curves:
-            axis.plot(x, y, color=colour, marker="" if steps else ".", linestyle="none" if markers_only else "-", label=label,
+            axis.plot(x, y, color=colour, marker="" if steps else ".", linestyle="none" if points else "-", label=label,
                       drawstyle="steps-post" if steps else "default")
-        if markers_only:
+        if diagonal:
             ends = [min(np.min(x) for _, _, x, _ in curves), max(np.max(x) for _, _, x, _ in curves)]
             axis.plot(ends, ends, color=FAINT, linewidth=0.8)
         axis.set(xscale=scales[0], yscale=scales[1], title=title, xlabel=x_label)
