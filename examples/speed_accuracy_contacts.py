@@ -3,7 +3,7 @@
     ./run examples/speed_accuracy_contacts.py --out out/speed_accuracy_contacts
 
 Flags
-    --parts NAME ...    problems, columns, estimate, states, runs (all)
+    --parts NAME ...    problems, columns, estimate, states, runs, spheres (all)
     --repeat N          times are medians of so many solves (11)
     --out DIR           results.json, tables.md and figures (out/speed_accuracy_contacts)
     --quick             three solves, columns of up to 40 layers, without Siconos
@@ -15,8 +15,9 @@ columns: single columns of discs from zero impulses until every contact force is
 estimate: the global error estimate against the true error, over sweeps of NLGS on such columns, single and four wide (hexagonal).
 states: one sub-step of plane Couette flow (dry_couette.py: collisional, size ratio 1 at 20 /s, and quasi-static, 1.5 at 1 /s) by every solver of
     scenes at tolerances from 0.1 to 1e-8, warm; errors in the energy norm against the solver's own solution at 1e-9.
-runs: whole runs over tolerance, sub-steps and time step, beside LAMMPS where it is installed (whole_runs.py); about half an hour. Runs that
-    --out/runs holds are not made again.
+runs: whole runs over tolerance, sub-steps and time step, beside LAMMPS where it is installed (whole_runs.py); about half an hour.
+spheres: 10 000 spheres sheared between rough walls at I = 0.01, and the time that LAMMPS takes for them. Runs that --out/runs and --out/spheres
+    hold are not made again.
 
 results.json, flat; lists run over the cases of a part:
     problems problem_solvers problem_tolerances problem_errors problem_times   time [s], null: not solved in 20 000 iterations
@@ -25,6 +26,7 @@ results.json, flat; lists run over the cases of a part:
     state_names state_solvers state_tolerances state_residuals state_errors state_times [s] state_sweeps state_updates state_converged
     state_contacts_NAME  state_gain_NAME   time of nlgs over that of auto at a residual of 1e-4, interpolated [-]
     run_names run_mu run_mu_err run_phi run_phi_err run_overlap run_overlap_max [d] run_seconds (per simulated second) run_unconverged run_sub_steps
+    sphere_names sphere_mu sphere_mu_err sphere_phi sphere_phi_err sphere_overlap_max [d] sphere_unconverged sphere_seconds (per unit strain)
     estimate_layers estimate_width estimate_sweeps estimate_residuals estimate_true estimate_estimates estimate_ratio_min estimate_ratio_max
 """
 
@@ -45,7 +47,7 @@ GRAVITY, RADIUS, DENSITY, DT = 9.81, 1e-3, 2500.0, 1e-3
 MOST = 20000  # iterations
 COLOURS = {"nlgs": "#1f5fa8", "newton": "#c2452d", "auto": "#222222", "active_set": "#2e7d4f", "accelerated": "#7a4fa3", "siconos": "#8a5a00"}
 SCENE_SOLVERS = ("nlgs", "active_set", "accelerated", "newton", "auto")
-PARTS = ("problems", "columns", "estimate", "states", "runs")
+PARTS = ("problems", "columns", "estimate", "states", "runs", "spheres")
 STATES = {"collisional": (1.0, 20.0), "quasi-static": (1.5, 1.0)}  # size ratio, rate [1/s]
 
 
@@ -272,6 +274,8 @@ def tables(results):
                   zip(*(results[f"state_{k}"] for k in ("names", "solvers", "tolerances", "residuals", "errors", "times", "sweeps", "updates")))]
     if "run_names" in results:
         lines += whole_runs.table(results)
+    if "sphere_names" in results:
+        lines += whole_runs.sphere_table(results)
     return "\n".join(lines) + "\n"
 
 
@@ -307,7 +311,7 @@ def main():
     results = {}
     for part in flags.parts:
         results |= {"problems": measure_problems, "columns": measure_columns, "estimate": measure_estimate, "states": measure_states,
-                    "runs": whole_runs.measure}[part](flags)
+                    "runs": whole_runs.measure, "spheres": whole_runs.measure_spheres}[part](flags)
     study.write_results(flags.out / "results.json", results)
     text = tables(results)
     (flags.out / "tables.md").write_text(text)

@@ -1,8 +1,9 @@
 """Whole runs of the rough-walled Couette cell for speed_accuracy_contacts.py: what tolerance, sub-steps, time step, and soft grains change.
 
-5103 discs, size ratio 1.5, rate 10 /s, rough walls on both sides (dry_couette.py). All runs go on from one developed state, ours and those of
+measure(): 5103 discs, size ratio 1.5, rate 10 /s, rough walls on both sides (dry_couette.py). All runs go on from one developed state, ours and those of
 LAMMPS (kn/P from 1e3 to 1e5; where `lmp` is installed). Friction is measured at the walls, over the load; the fraction from their distance; overlaps from
 positions every 0.05 s; each by the same function for both codes, each on one core.
+measure_spheres(): 10 000 spheres between rough walls.
 """
 
 import json
@@ -85,49 +86,168 @@ def run_ours(scene, state, settings, length):
         "seconds": wall_time / length, "unconverged": unconverged, "sub_steps": sub_steps}
 
 
-def write_data(path, scene):
-    """The present state for LAMMPS: types 1 grains, 2 and 3 the lower and the upper wall. Heights from the lower wall's centres."""
-    position, radius = scene.fixed_grains()
-    sim, half = scene.sim, len(radius) // 2
-    x = np.concatenate([sim.position, position])
-    x = np.column_stack([x[:, 0] % scene.width, x[:, 1] - scene.walls[0].position[1]])
-    speed = RATE * 0.05
-    v = np.concatenate([sim.velocity, np.repeat([(-speed, 0.0), (speed, 0.0)], half, axis=0)])
-    kind = np.repeat([1, 2, 3], [sim.count, half, half])
-    r = np.concatenate([sim.radius, radius])
-    spin = np.concatenate([sim.spin, np.zeros(2 * half)])
-    ids = np.arange(1, len(x) + 1)
+def write_data(path, sim, walls, period, wall_grains):
+    """The present state for LAMMPS: types 1 grains, 2 and 3 the grains of the lower and of the upper wall; heights from the lower wall."""
+    dim, half = sim.dim, len(wall_grains[1]) // 2
+    r = np.concatenate([sim.radius, wall_grains[1]])
+    x = np.zeros((len(r), 3))
+    x[:, :dim] = np.concatenate([sim.position, wall_grains[0]])
+    x[:, 0] %= period
+    x[:, 1] -= walls[0].position[1]
+    if dim == 3:
+        x[:, 2] %= period
+    v, spin = np.zeros((len(r), 3)), np.zeros((len(r), 3))
+    v[:sim.count, :dim] = sim.velocity
+    v[sim.count:, 0] = np.repeat([wall.velocity[0] for wall in walls], half)
+    spin[:sim.count, 2 if dim == 2 else slice(None)] = sim.spin
+    kind, ids = np.repeat([1, 2, 3], [sim.count, half, half]), np.arange(1, len(r) + 1)
+    depth = (0, period) if dim == 3 else (-0.002, 0.002)
     with open(path, "w") as file:
-        file.write(f"plane Couette flow\n\n{len(x)} atoms\n3 atom types\n\n0 {scene.width} xlo xhi\n-0.01 0.5 ylo yhi\n-0.002 0.002 zlo zhi\n\nAtoms # sphere\n\n")
-        np.savetxt(file, np.column_stack([ids, kind, 2 * r, np.full(len(x), 1000.0), x, 0 * r]), "%d %d %.12g %g %.12g %.12g %g")
+        file.write(f"plane Couette flow\n\n{len(r)} atoms\n3 atom types\n\n0 {period} xlo xhi\n-0.01 0.5 ylo yhi\n{depth[0]} {depth[1]} zlo zhi\n\nAtoms # sphere\n\n")
+        np.savetxt(file, np.column_stack([ids, kind, 2 * r, np.full(len(r), DENSITY[dim]), x]), "%d %d %.12g %g %.12g %.12g %.12g")
         file.write("\nVelocities\n\n")
-        np.savetxt(file, np.column_stack([ids, v, 0 * r, 0 * r, 0 * r, spin]), "%d %.9g %.9g %g %g %g %.9g")
+        np.savetxt(file, np.column_stack([ids, v, spin]), "%d" + 6 * " %.9g")
 
 
-def run_lammps(scene, folder, kappa, length):
-    """None where LAMMPS is not installed."""
+def run_lammps(sim, walls, period, wall_grains, folder, kappa, r_min, settle, timed, average):
+    """Seconds per simulated second over `timed`, and what LAMMPS printed; springs of kn = kappa P (3D: kappa P d). None where it is not installed."""
     if shutil.which("lmp") is None:
         return None
     folder.mkdir(parents=True, exist_ok=True)
-    write_data(folder / "start.data", scene)
-    variables = {"kappa": kappa, "skin": 1.2e-3 if kappa < 1e3 else 0.8e-3 if kappa < 1e5 else 0.6e-3, "rmin": 0.8e-3, "P": PRESSURE, "w": scene.width,
-                 "settle": SETTLE, "time": length}
-    done = subprocess.run(["lmp", "-in", Path(__file__).parent / "peers" / "couette.lammps", *(word for name, value in variables.items() for word in ("-var", name, f"{value:g}"))],
-                          cwd=folder, env={"OMP_NUM_THREADS": "1", "PATH": "/usr/bin:/bin", "OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"},
-                          capture_output=True, text=True)
+    write_data(folder / "start.data", sim, walls, period, wall_grains)
+    dim, d = sim.dim, 2 * wall_grains[1][0]
+    area, pressure = (period, PRESSURE) if dim == 2 else (period**2, SPHERE_PRESSURE)
+    kn = kappa * pressure * (1.0 if dim == 2 else d)
+    mass = {r: DENSITY[dim] * (np.pi * r**2 if dim == 2 else 4 / 3 * np.pi * r**3) for r in (d / 2, r_min)}
+    damping = -np.log(0.1) / np.hypot(np.pi, np.log(0.1))  # of its critical value: restitution 0.1, the least that gran/hooke is used with
+    variables = {"dim": dim, "kn": kn, "gn": 2 * damping * np.sqrt(kn / (mass[d / 2] / 2)), "dt": np.pi * np.sqrt(mass[r_min] / 2 / kn) / 20,
+                 "force": 2 * pressure * area / len(wall_grains[1]), "area": area * pressure, "settle": settle, "time": timed, "average": average,
+                 "skin": d * (0.6 if kappa < 1e3 else 0.4 if kappa < 1e5 else 0.3)}
+    done = subprocess.run(["lmp", "-in", Path(__file__).parent / "peers" / "couette.lammps",
+                           *(word for name, value in variables.items() for word in ("-var", name, f"{value:.12g}"))], cwd=folder, capture_output=True, text=True,
+                          env={"OMP_NUM_THREADS": "1", "PATH": "/usr/bin:/bin", "OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"})
     if done.returncode != 0:
         raise RuntimeError(f"lmp failed: {done.stdout[-500:]}{done.stderr[-500:]}")
-    loops = [float(seconds) for seconds in re.findall(r"Loop time of (\S+) on", done.stdout)]
-    steps, dt = re.search(r"^TIMED (\S+) (\S+)$", done.stdout, re.M).groups()
+    seconds = float(re.findall(r"Loop time of (\S+) on", done.stdout)[1])
+    steps, dt = map(float, re.search(r"^TIMED (\S+) (\S+)$", done.stdout, re.M).groups())
+    return seconds / (steps * dt), dt
+
+
+def run_soft_discs(scene, state, folder, kappa, length):
+    scene.sim.restore(state)
+    found = run_lammps(scene.sim, scene.walls, scene.width, scene.fixed_grains(), folder, kappa, 0.8 * RADIUS, SETTLE, 0.5, length)
+    if found is None:
+        return None
     series = np.loadtxt(folder / "series")
-    h, friction = series[:, 1], 0.5 * np.abs(series[:, 2:4]).sum(axis=1)
-    frames, lines = [], (folder / "frames").read_text().split("ITEM: TIMESTEP")[1:]
-    for frame in lines:
+    h, friction = series[:, 1] - 2 * RADIUS, 0.5 * np.abs(series[:, 2:4]).sum(axis=1)
+    frames = []
+    for frame in (folder / "frames").read_text().split("ITEM: TIMESTEP")[1:]:
         rows = np.array([row.split() for row in frame.split("ITEM: ATOMS")[1].split("\n")[1:] if row], float)
         rows = rows[rows[:, 1] == 1]
         frames.append((rows[:, 2:4], rows[:, 4]))
     return averages(h, friction, scene.solid, scene.width, frames) | {
-        "seconds": loops[1] / (float(steps) * float(dt)), "unconverged": 0, "sub_steps": int(length / float(dt))}
+        "seconds": found[0], "unconverged": 0, "sub_steps": int(length / found[1])}
+
+
+# Spheres: periodic along x and z, between walls of touching spheres on a square lattice, I = 0.01.
+SPHERE_PRESSURE, INERTIAL_NUMBER = 1000.0, 0.01  # [Pa], [-]
+DENSITY = {2: 1000.0, 3: 2500.0}  # [kg/m^3]
+
+
+class Spheres:
+    def __init__(self, count, columns):
+        rng, d = np.random.default_rng(0), 1e-3
+        self.period = columns * d
+        per_row = int(self.period / (1.12 * d))
+        spacing = self.period / per_row
+        k = np.arange(count)
+        site = (np.column_stack([k % per_row, k // per_row**2, k // per_row % per_row]) + 0.5) * spacing
+        site -= [self.period / 2, 0.5 * (site[-1, 1] + spacing / 2), self.period / 2]
+        height = 2 * site[-1, 1] + spacing
+        self.inertial_time = d * np.sqrt(DENSITY[3] / SPHERE_PRESSURE)
+        self.rate = INERTIAL_NUMBER / self.inertial_time
+        radius = d / 2 * rng.uniform(0.9, 1.1, count)
+        self.solid = 4 / 3 * np.pi * (radius**3).sum()
+        speed = 0.5 * self.rate * self.solid / (0.59 * self.period**2)  # at the height of a dense flow
+        velocity = 0.05 * speed * rng.uniform(-1, 1, site.shape)
+        velocity[:, 0] += speed * site[:, 1] / (height / 2)
+        self.sim = grains.Simulation(dim=3, period=(self.period, None, self.period), threads=1, accept_unconverged=True)
+        for other in ("grain", "wall"):
+            self.sim.set_friction("grain", other, 0.4)
+        self.sim.add(site, radius, density=DENSITY[3], velocity=velocity, material="grain")
+        x, z = (axis.ravel() for axis in np.meshgrid(*2 * [(np.arange(columns) + 0.5) * d - self.period / 2]))
+        self.walls, rows = [], []
+        for side in (-1, 1):
+            y = side * (height / 2 + d / 2)
+            wall = self.sim.add_plane((0, y, 0), (0, -side, 0), material="wall", velocity=(side * speed, None, 0.0),
+                                      load=(None, -side * SPHERE_PRESSURE * self.period**2, None))
+            rows.append(np.column_stack([x, np.full(x.size, y), z]))
+            self.sim.attach(wall, rows[-1], np.full(x.size, d / 2), material="grain")
+            self.walls.append(wall)
+        self.rows, self.d = rows, d
+
+    def wall_grains(self):
+        moved = [row + (wall.position - (0.0, row[0, 1], 0.0)) for wall, row in zip(self.walls, self.rows)]
+        return np.concatenate(moved), np.full(sum(map(len, moved)), self.d / 2)
+
+    def shear(self, strain, settings):
+        """Means over a strain, and seconds per unit strain."""
+        sim, area, dt = self.sim, self.period**2, settings["dt"] * self.inertial_time
+        sim.tolerance = settings["tolerance"]
+        rows, unconverged, overlap, start = [], 0, 0.0, time.perf_counter()
+        for _ in range(round(strain / (self.rate * dt))):
+            report = sim.step(dt)
+            unconverged += report.unconverged
+            overlap = max(overlap, report.max_overlap / self.d)
+            lower, upper = self.walls
+            rows.append((self.solid / (area * (upper.position[1] - lower.position[1] - self.d)), 0.5 * (lower.force[0] - upper.force[0]) / (SPHERE_PRESSURE * area)))
+        seconds = time.perf_counter() - start
+        phi, mu = (grains.block_average(x) for x in np.array(rows).T)
+        return {"mu": mu.mean, "mu_err": mu.error, "phi": phi.mean, "phi_err": phi.error, "overlap_max": overlap, "unconverged": unconverged,
+                "seconds": seconds / (len(rows) * self.rate * dt)}
+
+
+# dt in inertial times. Larger steps cost more per strain: impulses grow with h^2, and with them the sweeps to the same overlap.
+SPHERE_CASES = {"reference": {"tolerance": 3e-3, "dt": 0.05}, "default": {"tolerance": 1e-2, "dt": 0.1}, "tolerance 0.03": {"tolerance": 3e-2, "dt": 0.1},
+                "tolerance 0.1": {"tolerance": 0.1, "dt": 0.1}}
+
+
+def measure_spheres(flags):
+    """As measure(), for spheres; LAMMPS is timed over a strain of 0.02 only."""
+    folder = flags.out / "spheres"
+    folder.mkdir(parents=True, exist_ok=True)
+    cell = Spheres(600, 8) if flags.quick else Spheres(10000, 20)
+    strain = 0.1 if flags.quick else 3.0
+    kept = folder / "state.npy"
+    if not kept.exists():
+        cell.shear(0.3 if flags.quick else 2.0, {"tolerance": 0.03, "dt": 0.1})
+        np.save(kept, cell.sim.state())
+    state, rows = np.load(kept), {}
+
+    def ours(settings):
+        cell.sim.restore(state)
+        cell.shear(strain / 10, settings)
+        return cell.shear(strain, settings)
+
+    def soft():
+        cell.sim.restore(state)
+        unit = 1 / cell.rate
+        found = run_lammps(cell.sim, cell.walls, cell.period, cell.wall_grains(), folder / "lammps", 1e4, 0.9 * cell.d / 2, 0.005 * unit, 0.02 * unit, 0)
+        return found and dict.fromkeys(("mu", "mu_err", "phi", "phi_err", "overlap_max", "unconverged")) | {"seconds": found[0] * unit}
+
+    runs = {name: (lambda s=settings: ours(s)) for name, settings in SPHERE_CASES.items() if not flags.quick or name == "default"}
+    if not flags.quick:
+        runs["LAMMPS 1e4"] = soft
+    for name, run in runs.items():
+        path = folder / f"{name}.json"
+        if not path.exists():
+            if (found := run()) is None:
+                continue
+            study.write_results(path, found)
+            print(f"spheres, {name}: {found['seconds']:.1f} s per unit strain", flush=True)
+        rows[name] = json.loads(path.read_text())
+    names = ("mu", "mu_err", "phi", "phi_err", "overlap_max", "unconverged", "seconds")
+    return {"sphere_names": list(rows)} | {f"sphere_{name}": [row[name] for row in rows.values()] for name in names}
 
 
 def measure(flags):
@@ -147,8 +267,7 @@ def measure(flags):
     if not flags.quick:
         for kappa in (1e3, 1e4, 1e5):
             def soft(kappa=kappa):
-                scene.sim.restore(state)
-                return run_lammps(scene, folder / f"lammps_{kappa:g}", kappa, length)
+                return run_soft_discs(scene, state, folder / f"lammps_{kappa:g}", kappa, length)
             runs[f"LAMMPS {kappa:g}"] = soft
     rows = {}
     for name, run in runs.items():
@@ -171,6 +290,19 @@ def table(results):
         mu, mu_err, phi, phi_err, mean, largest, seconds = (results[f"run_{x}"][k] for x in ("mu", "mu_err", "phi", "phi_err", "overlap", "overlap_max", "seconds"))
         lines.append(f"| {name} | {seconds:.2f} | {mu:.4f} +- {mu_err or np.nan:.4f} | {100 * (mu / reference['mu'] - 1):+.2f} % | {phi:.4f} +- {phi_err or np.nan:.4f} "
                      f"| {100 * (phi / reference['phi'] - 1):+.2f} % | {mean:.1e} | {largest:.1e} |")
+    return lines
+
+
+def sphere_table(results):
+    lines = ["", "10 000 spheres between rough walls, I = 0.01, one core", "",
+             "| run | s per unit strain | mu | phi | largest overlap / d | unconverged |", "|---" * 6 + "|"]
+
+    def with_error(value, error):
+        return "-" if value is None else f"{value:.4f} +- {error or np.nan:.4f}"
+
+    for name, mu, mu_err, phi, phi_err, overlap, unconverged, seconds in zip(*(results[f"sphere_{x}"] for x in (
+            "names", "mu", "mu_err", "phi", "phi_err", "overlap_max", "unconverged", "seconds"))):
+        lines.append(f"| {name} | {seconds:.1f} | {with_error(mu, mu_err)} | {with_error(phi, phi_err)} | {'-' if overlap is None else f'{overlap:.1e}'} | {unconverged if unconverged is not None else '-'} |")
     return lines
 
 

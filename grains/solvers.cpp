@@ -572,8 +572,9 @@ SolveReport solve_accelerated(Problem<dim>& problem, const SolverSettings& setti
 
 // What the active set has not solved by then reaches over many layers.
 constexpr int local_sweeps = 300;
-// Factorising W of more contacts than that takes longer than any number of sweeps that a step may make, and gigabytes.
-constexpr std::size_t newton_contacts = 100000;
+// Factorising W of more contacts than that takes half a second; they are wide rather than tall, and sweeps do.
+template <int dim>
+constexpr std::size_t newton_contacts = dim == 2 ? 10000 : 2000;
 
 template <int dim>
 SolveReport solve_auto(Problem<dim>& problem, const SolverSettings& settings) {
@@ -586,7 +587,7 @@ SolveReport solve_auto(Problem<dim>& problem, const SolverSettings& settings) {
   };
   const std::size_t contacts = std::accumulate(problem.count.begin(), problem.count.end(), problem.wall_contacts.size());
   if (!report.converged && settings.max_sweeps > local_sweeps) go_on(solve_accelerated(problem, settings));
-  if (!report.converged && contacts <= newton_contacts) go_on(solve_newton(problem, few));
+  if (!report.converged && contacts <= newton_contacts<dim>) go_on(solve_newton(problem, few));
   if (!report.converged) go_on(solve_nlgs(problem, settings));
   return report;
 }

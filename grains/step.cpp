@@ -26,7 +26,7 @@ constexpr double overlap_share = 0.06;
 
 // Overlaps above this share of the tolerance, in mean diameters, are taken back: the errors of a contact that lasts add up.
 constexpr double repair_above = 0.03;
-constexpr double repaired = 1.0;  // of the excess, in a sub-step
+constexpr double repaired = 0.5;  // of the excess, in a sub-step
 
 }  // namespace
 

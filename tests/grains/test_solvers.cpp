@@ -91,8 +91,11 @@ TYPED_TEST(Solvers, a_column_at_rest_starts_from_its_solution_and_needs_few_roun
   auto sim = column<dim>(30);
   const int cold = sim.step(1e-3).sweeps;
   for (int k = 0; k < 50; ++k) sim.step(1e-3);
-  EXPECT_LE(30 * sim.step(1e-3).sweeps, cold);
-  EXPECT_LE(30 * sim.step(0.3e-3).sweeps, cold);  // impulses are scaled with the step
+  for (double dt : {1e-3, 0.3e-3}) {  // impulses are scaled with the step
+    int sweeps = 0;
+    for (int k = 0; k < 20; ++k) sweeps += sim.step(dt).sweeps;
+    EXPECT_LE(30 * sweeps, 20 * cold) << dt;
+  }
 }
 
 // A sub-step adds at most the error allowed to one contact, a share of the tolerance in diameters; repair keeps that from adding up.
