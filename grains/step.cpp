@@ -444,34 +444,47 @@ SolveReport Simulation<dim>::solve_contacts(double h) {
 
 // Newton's law for contacts that would close in this sub-step and approach faster than the rest speed:
 //   0 <= u_n + e u_n^-  perp  p_n >= 0,  without the gap term;  u_t + e_t u_t^- in the place of u_t.
-// Returns whether any contact rebounds.
+// Once any contact rebounds, one that was opening is held no firmer than by that law, u_n >= -e u_n^-: held at its gap it would turn what
+// others rebound with into kinetic energy (three balls in a row, e = 1: by 14 %). With every bias b >= e u_n^-, one e and no friction,
+//   (1+e) sum p u_n^- <= -p.W p <= 0  and so  change of energy = sum p (u_n^- - b)/2 <= (1-e)/2 sum p u_n^- <= 0.
+// J. J. Moreau, Unilateral contact and dry friction in finite freedom dynamics, CISM 302 (1988). Friction or unequal e may still break it.
+// Returns whether any contact rebounds; without one nothing is changed.
 template <int dim>
 bool Simulation<dim>::rebound() {
+  auto for_contacts = [&](auto&& visit) {
+    for (std::size_t b = 0; b < count_.size(); ++b)
+      for (int k = neighbours_.blocks[b].begin; k < neighbours_.blocks[b].begin + count_[b]; ++k) {
+        Contact<dim>& c = contacts_[k];
+        visit(c, materials_.pair(grains_.material[c.i], grains_.material[c.j]),
+              relative_velocity(body_before_[c.i], body_before_[c.j], c.n), bias_t_, k);
+      }
+    for (std::size_t k = 0; k < wall_contacts_.size(); ++k) {
+      WallContact<dim>& c = wall_contacts_[k];
+      const int fixed = neighbours_.wall_pairs[c.pair].fixed;
+      visit(c, materials_.pair(fixed >= 0 ? grains_.material[fixed] : walls_[c.wall].material, grains_.material[c.j]),
+            relative_velocity(wall_before_[c.wall], body_before_[c.j], c.n), wall_bias_t_, k);
+    }
+  };
+  auto rebounds = [&](const auto& c, const Materials::Pair& law, const Vec<dim>& u) {
+    return c.p.n > 0 && u.dot(c.n) < -settings.rest_speed && (law.normal > 0 || law.tangential > 0);
+  };
   bool any = false;
+  for_contacts([&](const auto& c, const Materials::Pair& law, const Vec<dim>& u, auto&, std::size_t) { any = any || rebounds(c, law, u); });
+  if (!any) return false;
   if (tangential_restitution_) {
     bias_t_.assign(contacts_.size(), zero<Tangent<dim>>());
     wall_bias_t_.assign(wall_contacts_.size(), zero<Tangent<dim>>());
   }
-  auto apply = [&](auto& c, const Materials::Pair& law, const Vec<dim>& u, std::vector<Tangent<dim>>& bias_t, std::size_t k) {
+  for_contacts([&](auto& c, const Materials::Pair& law, const Vec<dim>& u, std::vector<Tangent<dim>>& bias_t, std::size_t k) {
     const double u_n = u.dot(c.n);
-    if (c.p.n <= 0 || u_n >= -settings.rest_speed || (law.normal == 0 && law.tangential == 0)) return;
-    c.bias = law.normal * u_n;
-    if (tangential_restitution_) bias_t[k] = law.tangential * tangential(u, c.n);
-    any = true;
-  };
-  for (std::size_t b = 0; b < count_.size(); ++b)
-    for (int k = neighbours_.blocks[b].begin; k < neighbours_.blocks[b].begin + count_[b]; ++k) {
-      Contact<dim>& c = contacts_[k];
-      apply(c, materials_.pair(grains_.material[c.i], grains_.material[c.j]),
-            relative_velocity(body_before_[c.i], body_before_[c.j], c.n), bias_t_, k);
+    if (rebounds(c, law, u)) {
+      c.bias = law.normal * u_n;
+      if (tangential_restitution_) bias_t[k] = law.tangential * tangential(u, c.n);
+    } else {
+      c.bias = std::max(c.bias, law.normal * u_n);
     }
-  for (std::size_t k = 0; k < wall_contacts_.size(); ++k) {
-    WallContact<dim>& c = wall_contacts_[k];
-    const int fixed = neighbours_.wall_pairs[c.pair].fixed;
-    apply(c, materials_.pair(fixed >= 0 ? grains_.material[fixed] : walls_[c.wall].material, grains_.material[c.j]),
-          relative_velocity(wall_before_[c.wall], body_before_[c.j], c.n), wall_bias_t_, k);
-  }
-  return any;
+  });
+  return true;
 }
 
 // Work, dissipation and stress of the sub-step. With p the impulse of a contact and u its relative velocity, the change of kinetic
