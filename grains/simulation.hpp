@@ -149,7 +149,7 @@ class Simulation {
   void find_contacts(double h, double alert, double wall_alert);
   Problem<dim> problem();
   SolveReport solve_contacts(double h);
-  bool rebound();
+  bool rebound(double h);
   void accelerate(double h);
   void account(double h, StepReport<dim>& report);
   void move(double h);

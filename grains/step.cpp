@@ -429,7 +429,7 @@ SolveReport Simulation<dim>::solve_contacts(double h) {
   limits.rounding = 8 * std::numeric_limits<double>::epsilon() * std::sqrt(fastest2);
   limits.worst = overlap_share * settings.solve.tolerance * 2 * mean_radius_ / h;
   SolveReport report = solve(problem, limits);
-  if (restitution_ && rebound()) {
+  if (restitution_ && rebound(h)) {
     if (tangential_restitution_) problem.bias_t = bias_t_, problem.wall_bias_t = wall_bias_t_;
     const SolveReport second = solve(problem, limits);
     report = {report.sweeps + second.sweeps, report.updates + second.updates, second.residual, second.worst, second.converged};
@@ -448,9 +448,11 @@ SolveReport Simulation<dim>::solve_contacts(double h) {
 // others rebound with into kinetic energy (three balls in a row, e = 1: by 14 %). With every bias b >= e u_n^-, one e and no friction,
 //   (1+e) sum p u_n^- <= -p.W p <= 0  and so  change of energy = sum p (u_n^- - b)/2 <= (1-e)/2 sum p u_n^- <= 0.
 // J. J. Moreau, Unilateral contact and dry friction in finite freedom dynamics, CISM 302 (1988). Friction or unequal e may still break it.
+// A gap that the first solve left open can only be closed by what others rebound with. Held there, its grains would be braked before they
+// touch, with no rebound to follow: it is left to the next sub-step, to which they come overlapping by at most sub_step_motion radii.
 // Returns whether any contact rebounds; without one nothing is changed.
 template <int dim>
-bool Simulation<dim>::rebound() {
+bool Simulation<dim>::rebound(double h) {
   auto for_contacts = [&](auto&& visit) {
     for (std::size_t b = 0; b < count_.size(); ++b)
       for (int k = neighbours_.blocks[b].begin; k < neighbours_.blocks[b].begin + count_[b]; ++k) {
@@ -481,6 +483,7 @@ bool Simulation<dim>::rebound() {
       c.bias = law.normal * u_n;
       if (tangential_restitution_) bias_t[k] = law.tangential * tangential(u, c.n);
     } else {
+      if (c.p.n <= 0 && c.bias > 0 && law.normal > 0) c.bias += settings.sub_step_motion * grains_.r[c.j] / h;
       c.bias = std::max(c.bias, law.normal * u_n);
     }
   });

@@ -99,6 +99,18 @@ TYPED_TEST(Collisions, a_ball_struck_while_its_neighbour_moves_off_makes_no_ener
     }
 }
 
+// As if all were at e = 0 the second ball would not reach the third in this step, but it rebounds twice as fast.
+TYPED_TEST(Collisions, a_ball_that_rebounds_towards_a_third_hands_on_all_its_energy) {
+  constexpr int dim = TypeParam::value;
+  const double h = 1e-4;
+  auto sim = scene<dim>(0.0);
+  sim.set_restitution("grain", "grain", 1.0, 0.0);
+  for (int k = 0; k < 3; ++k) add<dim>(sim, in_plane<dim>(2 * k * r + (k == 2 ? 0.7 * h : 0), 0), r, in_plane<dim>(k == 0 ? 1 : 0, 0));
+  sim.step(h);
+  EXPECT_LE(sim.step(h).max_overlap, 0.3 * h * (1 + 1e-6));  // it goes h where there was room for 0.7 h
+  for (int k = 0; k < 3; ++k) EXPECT_NEAR(velocities(sim)[k][0], k == 2 ? 1.0 : 0.0, 1e-8);
+}
+
 TYPED_TEST(Collisions, approaches_below_the_rest_speed_do_not_rebound) {
   constexpr int dim = TypeParam::value;
   for (double speed : {0.009, 0.011}) {
