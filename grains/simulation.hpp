@@ -145,11 +145,12 @@ class Simulation {
   int choose_threads();
   Motion measure_pairs();
   void repair_overlaps(double allowed);
+  double speed_of_missed(double h, double speed, double alert, double wall_alert) const;
   double sub_step_length(double left, double dt, const Motion& motion) const;
   void find_contacts(double h, double alert, double wall_alert);
   Problem<dim> problem();
   SolveReport solve_contacts(double h);
-  bool rebound();
+  bool rebound(double h);
   void accelerate(double h);
   void account(double h, StepReport<dim>& report);
   void move(double h);

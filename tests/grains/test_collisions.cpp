@@ -79,6 +79,38 @@ TYPED_TEST(Collisions, a_perfectly_elastic_ball_keeps_its_energy_over_hundreds_o
   EXPECT_NEAR(std::abs(velocities(sim)[0][1]), 1.0, 500 * 1e-9);  // the solver's tolerance in each
 }
 
+// The first ball strikes the second, which touches the third while that moves off: the third must not be struck by more than there is.
+TYPED_TEST(Collisions, a_ball_struck_while_its_neighbour_moves_off_makes_no_energy) {
+  constexpr int dim = TypeParam::value;
+  for (double e : {0.3, 0.8, 1.0})
+    for (double leaving : {0.0, 0.1, 0.5, 0.9}) {
+      auto sim = scene<dim>(0.0);
+      sim.set_restitution("grain", "grain", e, 0.0);
+      for (int k = 0; k < 3; ++k) add<dim>(sim, in_plane<dim>(2 * k * r, 0), r, in_plane<dim>(k == 0 ? 1 : k == 1 ? 0 : leaving, 0));
+      const double before = 0.5 * mass<dim>(r) * (1 + squared(leaving));
+      const auto report = sim.step(1e-5);
+      EXPECT_LE(report.kinetic_energy, before * (1 + 1e-8)) << e << " " << leaving;
+      if (e == 1) { EXPECT_NEAR(report.kinetic_energy, before, 1e-8 * before) << leaving; }
+      if (e == 1 && leaving == 0.5) {  // one after the other: 1 and 2 exchange velocities, then 2 and 3 do
+        EXPECT_NEAR(velocities(sim)[0][0], 0.0, 1e-8);
+        EXPECT_NEAR(velocities(sim)[1][0], 1.0, 1e-8);
+        EXPECT_NEAR(velocities(sim)[2][0], 0.5, 1e-8);
+      }
+    }
+}
+
+// As if all were at e = 0 the second ball would not reach the third in this step, but it rebounds twice as fast.
+TYPED_TEST(Collisions, a_ball_that_rebounds_towards_a_third_hands_on_all_its_energy) {
+  constexpr int dim = TypeParam::value;
+  const double h = 1e-4;
+  auto sim = scene<dim>(0.0);
+  sim.set_restitution("grain", "grain", 1.0, 0.0);
+  for (int k = 0; k < 3; ++k) add<dim>(sim, in_plane<dim>(2 * k * r + (k == 2 ? 0.7 * h : 0), 0), r, in_plane<dim>(k == 0 ? 1 : 0, 0));
+  sim.step(h);
+  EXPECT_LE(sim.step(h).max_overlap, 0.3 * h * (1 + 1e-6));  // it goes h where there was room for 0.7 h
+  for (int k = 0; k < 3; ++k) EXPECT_NEAR(velocities(sim)[k][0], k == 2 ? 1.0 : 0.0, 1e-8);
+}
+
 TYPED_TEST(Collisions, approaches_below_the_rest_speed_do_not_rebound) {
   constexpr int dim = TypeParam::value;
   for (double speed : {0.009, 0.011}) {
