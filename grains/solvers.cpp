@@ -570,6 +570,9 @@ SolveReport solve_accelerated(Problem<dim>& problem, const SolverSettings& setti
   return by_law(problem, [&](auto law) { return accelerate<law>(problem, settings); });
 }
 
+// In fewer contacts than that there is nothing to leave out, and over-relaxation may carry forces that balance each other, as those of a
+// wedged disc, far away.
+constexpr std::size_t few_contacts = 100;
 // What the active set has not solved by then reaches over many layers.
 constexpr int local_sweeps = 300;
 // Factorising W of more contacts than that takes half a second; they are wide rather than tall, and sweeps do.
@@ -581,12 +584,14 @@ SolveReport solve_auto(Problem<dim>& problem, const SolverSettings& settings) {
   SolverSettings few = settings;
   few.max_sweeps = std::min(settings.max_sweeps, local_sweeps);
   few.max_newton = std::max(settings.max_newton / 5, 1);  // near the solution it converges soon or cycles
-  SolveReport report = solve_active_set(problem, few);
+  const std::size_t contacts = std::accumulate(problem.count.begin(), problem.count.end(), problem.wall_contacts.size());
+  SolveReport report;
+  report.converged = false;
+  if (contacts >= few_contacts) report = solve_active_set(problem, few);
   auto go_on = [&](const SolveReport& more) {
     report = {report.sweeps + more.sweeps, report.updates + more.updates, more.residual, more.worst, more.converged};
   };
-  const std::size_t contacts = std::accumulate(problem.count.begin(), problem.count.end(), problem.wall_contacts.size());
-  if (!report.converged && settings.max_sweeps > local_sweeps) go_on(solve_accelerated(problem, settings));
+  if (contacts < few_contacts || (!report.converged && settings.max_sweeps > local_sweeps)) go_on(solve_accelerated(problem, settings));
   if (!report.converged && contacts <= newton_contacts<dim>) go_on(solve_newton(problem, few));
   if (!report.converged) go_on(solve_nlgs(problem, settings));
   return report;

@@ -83,7 +83,7 @@ SolveReport solve_accelerated(Problem<dim>& problem, const SolverSettings& setti
 template <int dim>
 SolveReport solve_newton(Problem<dim>& problem, const SolverSettings& settings);
 
-// solve_active_set; what takes more than some hundred of its sweeps by solve_accelerated; should that run out of sweeps, solve_newton,
+// solve_active_set, but where there are few contacts; what takes more than some hundred of its sweeps by solve_accelerated; should that run out of sweeps, solve_newton,
 // then solve_nlgs.
 template <int dim>
 SolveReport solve_auto(Problem<dim>& problem, const SolverSettings& settings);

@@ -90,7 +90,7 @@ def test_a_disc_thirty_times_the_others_is_borne_by_them():
         late.append((on_big[1] / (GRAVITY * sim.mass[big]), -sum(wall.force[1] for wall in walls) / (GRAVITY * sim.mass.sum())))
     # Dry grains bear it all, there is no buoyancy. The mean over 0.2 s misses m dv/dt: some mm/s over 0.2 s x g.
     np.testing.assert_allclose(np.mean(late[-200:], axis=0), 1, atol=0.01)
-    assert overlap < 0.015 * D
+    assert overlap < 0.05 * D  # 0.44 where what is kicked out is not seen
 
 
 @pytest.mark.parametrize("share, radius", [(0.1, R), (0.5, R), (0.999, R), (0.5, 10 * R)])
@@ -287,7 +287,7 @@ def test_a_crystal_sheared_slides_under_stresses_of_the_order_of_the_load():
 @pytest.mark.parametrize("solver", ["nlgs", "newton", "auto"])
 def test_a_wedged_disc_is_at_rest_and_its_forces_are_some_of_those_that_balance(solver, mu):
     half = np.radians(30)
-    sim = scene(friction=mu, solver=solver, tolerance=1e-4 if (solver, mu) == ("auto", 1e6) else 1e-5)  # at 1e-5 one step in 1000 fails
+    sim = scene(friction=mu, solver=solver, tolerance=1e-5)
     sim.add([[0, R / np.sin(half)]], R, density=DENSITY)
     for side in (-1, 1):
         sim.add_plane((0, 0), (-side * np.cos(half), np.sin(half)))
@@ -300,7 +300,7 @@ def test_a_wedged_disc_is_at_rest_and_its_forces_are_some_of_those_that_balance(
     for _ in range(1000):
         sim.step(DT)
         forces.append(np.sort(sim.contacts()["force_normal"]) / weight)
-    assert np.linalg.norm(sim.velocity) < 10 * sim.tolerance * GRAVITY * DT
+    assert np.linalg.norm(sim.velocity) < 1e-4 * GRAVITY * DT
     # 2 (N sin + T cos) = weight with |T| <= mu N: from T = mu N to T = -mu N, without bound where mu >= tan.
     low = 0.5 / (np.sin(half) + mu * np.cos(half))
     high = 0.5 / (np.sin(half) - mu * np.cos(half)) if mu < np.tan(half) else 101
