@@ -86,6 +86,20 @@ def run_ours(scene, state, settings, length):
         "seconds": wall_time / length, "unconverged": unconverged, "sub_steps": sub_steps}
 
 
+def made_once(folder, runs, per):
+    """Results of runs by name; those that the folder holds are not made again. A run that returns None is left out."""
+    rows = {}
+    for name, run in runs.items():
+        path = folder / f"{name}.json"
+        if not path.exists():
+            if (found := run()) is None:
+                continue
+            study.write_results(path, found)
+            print(f"{name}: {found['seconds']:.2f} s {per}", flush=True)
+        rows[name] = json.loads(path.read_text())
+    return rows
+
+
 def write_data(path, sim, walls, period, wall_grains):
     """The present state for LAMMPS: types 1 grains, 2 and 3 the grains of the lower and of the upper wall; heights from the lower wall."""
     dim, half = sim.dim, len(wall_grains[1]) // 2
@@ -222,7 +236,7 @@ def measure_spheres(flags):
     if not kept.exists():
         cell.shear(0.3 if flags.quick else 2.0, {"tolerance": 0.03, "dt": 0.1})
         np.save(kept, cell.sim.state())
-    state, rows = np.load(kept), {}
+    state = np.load(kept)
 
     def ours(settings):
         cell.sim.restore(state)
@@ -238,14 +252,7 @@ def measure_spheres(flags):
     runs = {name: (lambda s=settings: ours(s)) for name, settings in SPHERE_CASES.items() if not flags.quick or name == "default"}
     if not flags.quick:
         runs["LAMMPS 1e4"] = soft
-    for name, run in runs.items():
-        path = folder / f"{name}.json"
-        if not path.exists():
-            if (found := run()) is None:
-                continue
-            study.write_results(path, found)
-            print(f"spheres, {name}: {found['seconds']:.1f} s per unit strain", flush=True)
-        rows[name] = json.loads(path.read_text())
+    rows = made_once(folder, runs, "per unit strain")
     names = ("mu", "mu_err", "phi", "phi_err", "overlap_max", "unconverged", "seconds")
     return {"sphere_names": list(rows)} | {f"sphere_{name}": [row[name] for row in rows.values()] for name in names}
 
@@ -269,15 +276,7 @@ def measure(flags):
             def soft(kappa=kappa):
                 return run_soft_discs(scene, state, folder / f"lammps_{kappa:g}", kappa, length)
             runs[f"LAMMPS {kappa:g}"] = soft
-    rows = {}
-    for name, run in runs.items():
-        path = folder / f"{name}.json"
-        if not path.exists():
-            if (found := run()) is None:
-                continue
-            study.write_results(path, found)
-            print(f"{name}: {found['seconds']:.2f} s per simulated second, mu {found['mu']:.4f} +- {found['mu_err'] or np.nan:.4f}", flush=True)
-        rows[name] = json.loads(path.read_text())
+    rows = made_once(folder, runs, "per simulated second")
     names = ("mu", "mu_err", "phi", "phi_err", "overlap", "overlap_max", "seconds", "unconverged", "sub_steps")
     return {"run_names": list(rows)} | {f"run_{name}": [row[name] for row in rows.values()] for name in names}
 
