@@ -143,6 +143,8 @@ class Simulation {
   int add_wall(Wall<dim>& wall, const std::string& material, const char* where);
   void free_walls();
   int choose_threads();
+  NearWall<dim> near_wall(const WallPair<dim>& pair) const;
+  const Materials::Pair& law_of(const WallPair<dim>& pair) const;
   Motion measure_pairs();
   void repair_overlaps(double allowed);
   double speed_of_missed(double h, double speed, double alert, double wall_alert) const;

@@ -236,6 +236,24 @@ void Simulation<dim>::free_walls() {
     }
 }
 
+// From a wall, or the grain fixed to it, to the grain of the pair: the direction, and the distance of the surfaces.
+template <int dim>
+NearWall<dim> Simulation<dim>::near_wall(const WallPair<dim>& pair) const {
+  if (pair.fixed < 0) {
+    NearWall<dim> near = nearest_point(walls_[pair.wall], grains_.x[pair.j], box_);
+    near.distance -= grains_.r[pair.j];
+    return near;
+  }
+  const Vec<dim> branch = grains_.x[pair.j] - grains_.x[pair.fixed] + neighbours_.shifts[pair.shift];
+  const double length = branch.norm();
+  return {branch / length, length - (grains_.r[pair.j] + grains_.r[pair.fixed])};
+}
+
+template <int dim>
+const Materials::Pair& Simulation<dim>::law_of(const WallPair<dim>& pair) const {
+  return materials_.pair(pair.fixed >= 0 ? grains_.material[pair.fixed] : walls_[pair.wall].material, grains_.material[pair.j]);
+}
+
 // Gaps of all listed pairs, and how fast they move relative to each other.
 template <int dim>
 typename Simulation<dim>::Motion Simulation<dim>::measure_pairs() {
@@ -261,20 +279,14 @@ typename Simulation<dim>::Motion Simulation<dim>::measure_pairs() {
     const Wall<dim>& wall = walls_[pair.wall];
     const Vec<dim> u = grains_.body[pair.j].v - wall.v;
     const double r = grains_.r[pair.j];
-    double gap = 0.0, speed = u.norm();
-    if (pair.fixed >= 0) {
-      const double reach = r + grains_.r[pair.fixed];
-      gap = (grains_.x[pair.j] - grains_.x[pair.fixed] + neighbours_.shifts[pair.shift]).norm() - reach;
-      motion.rate = std::max(motion.rate, speed / reach);
-    } else {
-      const NearWall<dim> near = nearest_point(wall, grains_.x[pair.j], box_);
-      gap = near.distance - r;
-      if (wall.shape == Wall<dim>::Shape::plane) speed = std::abs(u.dot(near.n));  // the gap to a plane is linear: any step
-      else motion.rate = std::max(motion.rate, 0.5 * speed / r);
-    }
-    gap_[n + k] = gap;
+    const NearWall<dim> near = near_wall(pair);
+    double speed = u.norm();
+    if (pair.fixed >= 0) motion.rate = std::max(motion.rate, speed / (r + grains_.r[pair.fixed]));
+    else if (wall.shape == Wall<dim>::Shape::plane) speed = std::abs(u.dot(near.n));  // the gap to a plane is linear: any step
+    else motion.rate = std::max(motion.rate, 0.5 * speed / r);
+    gap_[n + k] = near.distance;
     motion.wall_speed = std::max(motion.wall_speed, speed);
-    motion.overlap = std::max(motion.overlap, -gap);
+    motion.overlap = std::max(motion.overlap, -near.distance);
   }
   return motion;
 }
@@ -295,10 +307,7 @@ void Simulation<dim>::repair_overlaps(double allowed) {
   for (std::size_t k = 0; k < neighbours_.wall_pairs.size(); ++k) {
     if (gap_[n + k] >= -allowed) continue;
     const WallPair<dim>& pair = neighbours_.wall_pairs[k];
-    Vec<dim> away = nearest_point(walls_[pair.wall], grains_.x[pair.j], box_).n;
-    if (pair.fixed >= 0)
-      away = (grains_.x[pair.j] - grains_.x[pair.fixed] + neighbours_.shifts[pair.shift]).normalized();
-    grains_.x[pair.j] += repaired * (-gap_[n + k] - allowed) * away;
+    grains_.x[pair.j] += repaired * (-gap_[n + k] - allowed) * near_wall(pair).n;
   }
 }
 
@@ -326,9 +335,7 @@ double Simulation<dim>::speed_of_missed(double h, double speed, double alert, do
     const WallPair<dim>& pair = neighbours_.wall_pairs[k];
     if (gap_[n + k] < wall_alert) continue;
     const Vec<dim> u = grains_.body[pair.j].v - walls_[pair.wall].v;
-    const Vec<dim> away = pair.fixed >= 0 ? Vec<dim>((grains_.x[pair.j] - grains_.x[pair.fixed] + neighbours_.shifts[pair.shift]).normalized())
-                                          : nearest_point(walls_[pair.wall], grains_.x[pair.j], box_).n;
-    if (gap_[n + k] + h * u.dot(away) < -allowed) speed2 = std::max(speed2, u.squaredNorm());
+    if (gap_[n + k] + h * u.dot(near_wall(pair).n) < -allowed) speed2 = std::max(speed2, u.squaredNorm());
   }
   return std::sqrt(speed2);
 }
@@ -412,20 +419,13 @@ void Simulation<dim>::find_contacts(double h, double alert, double wall_alert) {
     const Wall<dim>& wall = walls_[pair.wall];
     const Body<dim>& body = grains_.body[pair.j];
     WallContact<dim> c{};
-    std::uint8_t material = wall.material;
-    if (pair.fixed >= 0) {
-      const Vec<dim> branch = grains_.x[pair.j] - grains_.x[pair.fixed] + neighbours_.shifts[pair.shift];
-      c.n = branch / branch.norm();
-      material = grains_.material[pair.fixed];
-    } else {
-      c.n = nearest_point(wall, grains_.x[pair.j], box_).n;
-    }
+    c.n = near_wall(pair).n;
     c.bias = std::max(gap_[n + k], 0.0) / h;
     c.inv_w = 1.0 / (body.inv_m + c.n.cwiseProduct(wall.inv_m).dot(c.n));
     c.inv_w_t = 1.0 / (body.inv_m * (1 + 1 / grains_.inertia) + wall.inv_m.maxCoeff());
     if constexpr (dim == 2)
       c.inv_w_t = 1.0 / (body.inv_m * (1 + 1 / grains_.inertia) + c.n.y() * c.n.y() * wall.inv_m.x() + c.n.x() * c.n.x() * wall.inv_m.y());
-    c.friction = materials_.pair(material, grains_.material[pair.j]).friction;
+    c.friction = law_of(pair).friction;
     c.p = {scale * pair.p.n, scale * onto_plane(pair.p.t, c.n)};
     c.wall = pair.wall;
     c.j = pair.j;
@@ -512,8 +512,7 @@ bool Simulation<dim>::rebound(double h) {
       }
     for (std::size_t k = 0; k < wall_contacts_.size(); ++k) {
       WallContact<dim>& c = wall_contacts_[k];
-      const int fixed = neighbours_.wall_pairs[c.pair].fixed;
-      visit(c, materials_.pair(fixed >= 0 ? grains_.material[fixed] : walls_[c.wall].material, grains_.material[c.j]),
+      visit(c, law_of(neighbours_.wall_pairs[c.pair]),
             relative_velocity(wall_before_[c.wall], body_before_[c.j], c.n), wall_bias_t_, k);
     }
   };
