@@ -1,6 +1,7 @@
 // Problems with W written out: their error, sweeps over them, and the choice between sweeps and Newton's method (newton.cpp).
 #include "contact.hpp"
 #include "delassus_error.hpp"
+#include "restart.hpp"
 #include "errors.hpp"
 
 #include <Eigen/LU>

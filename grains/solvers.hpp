@@ -75,7 +75,7 @@ template <int dim>
 SolveReport solve_active_set(Problem<dim>& problem, const SolverSettings& settings);
 
 // Symmetric Gauss-Seidel (a sweep to and fro: X. Li, D. Sun, K.-C. Toh, Math. Program. 155 (2016)) with Nesterov's extrapolation and
-// restarts (contact.hpp): sweeps grow as the height of the scene, not as its square.
+// restarts (restart.hpp): sweeps grow as the height of the scene, not as its square.
 template <int dim>
 SolveReport solve_accelerated(Problem<dim>& problem, const SolverSettings& settings);
 
