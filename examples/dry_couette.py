@@ -63,6 +63,7 @@ of contacts between grains only.
 """
 
 import sys
+import types
 
 import numpy as np
 
@@ -79,7 +80,7 @@ THESIS = {  # table 3.1, mean (std); where these flags have their defaults
 }
 
 
-def parse_flags():
+def command_line():
     parser = study.Parser(__doc__, out="out/dry_couette", dt=1e-3, t_end=10.0, quick_t_end=2.0)
     parser.flag("--rate", type=study.number("1/s", above=0), default=10.0)
     parser.flag("--pressure", type=study.number("Pa", above=0), default=5.0)
@@ -90,7 +91,12 @@ def parse_flags():
     parser.flag("--wall-friction", type=study.number("", at_least=0), default=1.0)
     parser.flag("--rough-walls", action="store_true")
     parser.flag("--fixed-height", action="store_true")
-    return parser, parser.parse_args()
+    return parser
+
+
+def scene(**flags):
+    """The cell for other studies: flags by name, the others at their defaults."""
+    return Scene(types.SimpleNamespace(**command_line().defaults() | flags))
 
 
 class Scene:
@@ -245,7 +251,8 @@ def plot(results, scene, run, profile, flags):
 
 
 def main():
-    parser, flags = parse_flags()
+    parser = command_line()
+    flags = parser.parse_args()
     with parser.user_errors():
         scene = Scene(flags)
     with parser.user_errors(OSError):  # of its files

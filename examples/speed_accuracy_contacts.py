@@ -33,7 +33,6 @@ results.json, flat; lists run over the cases of a part:
 import sys
 import tempfile
 import time
-import types
 from pathlib import Path
 
 import numpy as np
@@ -196,8 +195,7 @@ def measure_estimate(flags):
 def developed(size_ratio, rate, quick):
     """State of a flow after 2 s, and the sub-step that it takes [s]."""
     size = {"height": 0.03, "width": 0.06} if quick else {"height": 0.1, "width": 0.2}
-    scene = dry_couette.Scene(types.SimpleNamespace(seed=0, size_ratio=size_ratio, fixed_height=False, rough_walls=False, rate=rate, pressure=5.0,
-                                                    threads=1, tolerance=None, friction=0.4, wall_friction=1.0, t_end=10.0, dt=DT, **size))
+    scene = dry_couette.scene(size_ratio=size_ratio, rate=rate, threads=1, **size)
     for _ in range(300 if quick else 2000):
         report = scene.sim.step(DT)
     return scene.sim, scene.sim.state(), DT / report.sub_steps

@@ -11,7 +11,6 @@ import re
 import shutil
 import subprocess
 import time
-import types
 from pathlib import Path
 
 import numpy as np
@@ -38,9 +37,7 @@ def cases(quick):
 
 def make_scene(quick):
     size = {"height": 0.03, "width": 0.06} if quick else {"height": 0.1, "width": WIDTH}
-    return dry_couette.Scene(types.SimpleNamespace(
-        seed=0, size_ratio=1.5, fixed_height=False, rough_walls=True, rate=RATE * 0.1 / size["height"], pressure=PRESSURE, threads=1,
-        tolerance=None, friction=0.4, wall_friction=1.0, t_end=10.0, dt=1e-3, **size))
+    return dry_couette.scene(size_ratio=1.5, rough_walls=True, rate=RATE * 0.1 / size["height"], pressure=PRESSURE, threads=1, **size)
 
 
 def overlaps(position, radius, period):
@@ -86,6 +83,15 @@ def run_ours(scene, state, settings, length):
         "seconds": wall_time / length, "unconverged": unconverged, "sub_steps": sub_steps}
 
 
+def developed_once(folder, sim, develop):
+    """The state from which all runs in the folder start; develop() leads there."""
+    path = folder / "state.npy"
+    if not path.exists():
+        develop()
+        np.save(path, sim.state())
+    return np.load(path)
+
+
 def made_once(folder, runs, per):
     """Results of runs by name; those that the folder holds are not made again. A run that returns None is left out."""
     rows = {}
@@ -124,7 +130,8 @@ def write_data(path, sim, walls, period, wall_grains):
 
 
 def run_lammps(sim, walls, period, wall_grains, folder, kappa, r_min, settle, timed, average):
-    """Seconds per simulated second over `timed`, and what LAMMPS printed; springs of kn = kappa P (3D: kappa P d). None where it is not installed."""
+    """LAMMPS from the present state, with springs of kn = kappa P (3D: kappa P d): `settle` s, `timed` s, and `average` s that leave `series` and
+    `frames` in the folder. Returns seconds per simulated second over `timed`, and its time step [s]; None where it is not installed."""
     if shutil.which("lmp") is None:
         return None
     folder.mkdir(parents=True, exist_ok=True)
@@ -135,7 +142,7 @@ def run_lammps(sim, walls, period, wall_grains, folder, kappa, r_min, settle, ti
     mass = {r: DENSITY[dim] * (np.pi * r**2 if dim == 2 else 4 / 3 * np.pi * r**3) for r in (d / 2, r_min)}
     damping = -np.log(0.1) / np.hypot(np.pi, np.log(0.1))  # of its critical value: restitution 0.1, the least that gran/hooke is used with
     variables = {"dim": dim, "kn": kn, "gn": 2 * damping * np.sqrt(kn / (mass[d / 2] / 2)), "dt": np.pi * np.sqrt(mass[r_min] / 2 / kn) / 20,
-                 "force": 2 * pressure * area / len(wall_grains[1]), "area": area * pressure, "settle": settle, "time": timed, "average": average,
+                 "force": 2 * pressure * area / len(wall_grains[1]), "load": area * pressure, "settle": settle, "time": timed, "average": average,
                  "skin": d * (0.6 if kappa < 1e3 else 0.4 if kappa < 1e5 else 0.3)}
     done = subprocess.run(["lmp", "-in", Path(__file__).parent / "peers" / "couette.lammps",
                            *(word for name, value in variables.items() for word in ("-var", name, f"{value:.12g}"))], cwd=folder, capture_output=True, text=True,
@@ -232,11 +239,7 @@ def measure_spheres(flags):
     folder.mkdir(parents=True, exist_ok=True)
     cell = Spheres(600, 8) if flags.quick else Spheres(10000, 20)
     strain = 0.1 if flags.quick else 3.0
-    kept = folder / "state.npy"
-    if not kept.exists():
-        cell.shear(0.3 if flags.quick else 2.0, {"tolerance": 0.03, "dt": 0.1})
-        np.save(kept, cell.sim.state())
-    state = np.load(kept)
+    state = developed_once(folder, cell.sim, lambda: cell.shear(0.3 if flags.quick else 2.0, {"tolerance": 0.03, "dt": 0.1}))
 
     def ours(settings):
         cell.sim.restore(state)
@@ -263,12 +266,7 @@ def measure(flags):
     folder = flags.out / "runs"
     folder.mkdir(parents=True, exist_ok=True)
     scene = make_scene(flags.quick)
-    kept = folder / "state.npy"
-    if not kept.exists():
-        for _ in range(500 if flags.quick else 4000):
-            scene.sim.step(1e-3)
-        np.save(kept, scene.sim.state())
-    state = np.load(kept)
+    state = developed_once(folder, scene.sim, lambda: [scene.sim.step(1e-3) for _ in range(500 if flags.quick else 4000)])
     runs = {name: (lambda s=settings, n=name: run_ours(scene, state, s, (2 if n == "reference" else 1) * length))
             for name, settings in cases(flags.quick).items()}
     if not flags.quick:

@@ -76,6 +76,10 @@ class Parser(CommandLine):
         if quick is not None:
             self.quick[action.dest] = quick
 
+    def defaults(self):
+        """The flags of an empty command line, by name; no directory is made."""
+        return vars(super().parse_args([]))
+
     def parse_args(self, args=None, namespace=None):
         """Parse and check the flags, and make the output directory."""
         flags = super().parse_args(args, namespace)
@@ -98,7 +102,7 @@ class Parser(CommandLine):
         """The flags of the run that left the checkpoint; given anew only where that does not change what has been computed."""
         with self.user_errors():
             before, _ = read_checkpoint(path)
-        defaults, absent = vars(super().parse_args([])), object()
+        defaults, absent = self.defaults(), object()
         self.set_defaults(**dict.fromkeys(defaults, absent))
         given = {name: value for name, value in vars(super().parse_args(args)).items() if value is not absent}
         self.set_defaults(**defaults)

@@ -10,7 +10,6 @@ import argparse
 import pathlib
 import sys
 import time
-import types
 
 import numpy as np
 
@@ -23,10 +22,7 @@ WIDTH, SPEED, PRESSURE, DT = 0.2, 0.5, 5.0, 1e-3
 
 
 def reference_scene(size_ratio, threads):
-    flags = types.SimpleNamespace(rate=10.0, pressure=PRESSURE, size_ratio=size_ratio, height=0.1, width=WIDTH, friction=0.4,
-                                  wall_friction=1.0, rough_walls=False, fixed_height=False, dt=DT, t_end=10.0,
-                                  tolerance=None, threads=threads, seed=0)
-    return dry_couette.Scene(flags)
+    return dry_couette.scene(pressure=PRESSURE, size_ratio=size_ratio, width=WIDTH, threads=threads)
 
 
 def copies(scene, n, threads):
