@@ -31,7 +31,8 @@ def cases(quick):
         changes |= {f"tolerance {x:g}": {"tolerance": x} for x in (0.3, 0.1, 0.03, 3e-3)}
         changes |= {f"motion {x:g}": {"sub_step_motion": x} for x in (0.05, 0.2, 0.5)}
         changes |= {f"dt {1e3 * x:g} ms": {"dt": x} for x in (5e-4, 2e-3, 4e-3)}
-        changes |= {"tolerance 0.03, motion 0.3, dt 2 ms": {"tolerance": 0.03, "sub_step_motion": 0.3, "dt": 2e-3}}
+        changes |= {"coarse: tolerance 0.03, dt 2 ms": {"tolerance": 0.03, "dt": 2e-3},
+                    "coarse: tolerance 0.03, motion 0.3, dt 2 ms": {"tolerance": 0.03, "sub_step_motion": 0.3, "dt": 2e-3}}
     return {name: default | change for name, change in changes.items()}
 
 
@@ -307,6 +308,7 @@ def plot(path, results):
     seconds, names = np.array(results["run_seconds"]), results["run_names"]
     kinds = [("LAMMPS", "#8a5a00", [n.startswith("LAMMPS") for n in names]), ("tolerance", "#1f5fa8", [n.startswith("tolerance") for n in names]),
              ("sub-steps", "#2e7d4f", [n.startswith("motion") for n in names]), ("dt", "#c2452d", [n.startswith("dt") for n in names]),
+             ("several", "#7b3fa0", [n.startswith("coarse") for n in names]),
              ("default", "#222222", [n == "default" for n in names])]
     panels = []
     for name in ("mu", "phi"):
