@@ -153,6 +153,18 @@ class ProximalProblem {
 constexpr double first_alpha = 1e-3, least_alpha = 1e-12, falls_by = 0.05;
 constexpr int most_inner = 30, most_outer = 60;
 
+// Iterates may leave the cones by their error; an answer pulls nothing together and holds no more than friction can.
+template <int dim>
+Eigen::VectorXd in_cones(const DelassusProblem<dim>& problem, Eigen::VectorXd r) {
+  for (int c = 0; c < problem.contacts(); ++c) {
+    auto p = r.template segment<dim>(dim * c);
+    p[0] = std::max(p[0], 0.0);
+    const double bound = problem.friction[c] * p[0], norm = p.template tail<dim - 1>().norm();
+    if (norm > bound) p.template tail<dim - 1>() *= bound / norm;
+  }
+  return r;
+}
+
 }  // namespace
 
 template <int dim>
@@ -187,7 +199,7 @@ void iterate_newton(const DelassusProblem<dim>& problem, Eigen::VectorXd& r, con
       centre = r;
       alpha = std::max(falls_by * alpha, least_alpha);
     }
-    best.look(r, report);
+    best.look(in_cones(problem, r), report);
     if (report.iterations >= settings.max_iterations) break;
   }
 }

@@ -534,6 +534,37 @@ constexpr int local_sweeps = 300;
 template <int dim>
 constexpr std::size_t newton_contacts = dim == 2 ? 10000 : 2000;
 
+// Few contacts side by side and many layers: W fills in little, and sweeps would have to carry forces through all layers. Layers are
+// those of a walk along the contacts that starts at the walls, and again at a grain of each part that it did not reach.
+template <int dim>
+bool is_narrow(const Problem<dim>& problem, std::size_t contacts) {
+  constexpr std::size_t widest = 4;  // contacts a layer
+  const int bodies = static_cast<int>(problem.bodies.size());
+  std::vector<int> first(bodies + 1, 0), neighbour(2 * contacts), reached;
+  auto each_pair = [&](auto&& visit) {
+    for (std::size_t b = 0; b < problem.blocks.size(); ++b)
+      for (int k = problem.blocks[b].begin; k < problem.blocks[b].begin + problem.count[b]; ++k) visit(problem.contacts[k].i, problem.contacts[k].j);
+  };
+  each_pair([&](int i, int j) { ++first[i], ++first[j]; });
+  std::partial_sum(first.begin(), first.end(), first.begin());
+  each_pair([&](int i, int j) { neighbour[--first[i]] = j, neighbour[--first[j]] = i; });
+  std::vector<char> seen(bodies, false);
+  auto reach = [&](int body) {
+    if (!seen[body]) seen[body] = true, reached.push_back(body);
+  };
+  std::size_t layers = 0, done = 0;
+  auto walk = [&] {
+    for (; done < reached.size(); ++layers)
+      for (const std::size_t end = reached.size(); done < end; ++done)
+        for (int k = first[reached[done]]; k < first[reached[done] + 1]; ++k) reach(neighbour[k]);
+  };
+  for (const WallContact<dim>& c : problem.wall_contacts) reach(c.j);
+  walk();
+  for (int body = 0; body < bodies; ++body)
+    if (first[body] < first[body + 1]) reach(body), walk();
+  return contacts <= widest * layers;
+}
+
 template <int dim>
 SolveReport solve_auto(Problem<dim>& problem, const SolverSettings& settings) {
   SolverSettings few = settings;
@@ -546,8 +577,10 @@ SolveReport solve_auto(Problem<dim>& problem, const SolverSettings& settings) {
   auto go_on = [&](const SolveReport& more) {
     report = {report.sweeps + more.sweeps, report.updates + more.updates, more.residual, more.worst, more.converged};
   };
-  if (contacts < few_contacts || (!report.converged && settings.max_sweeps > local_sweeps)) go_on(solve_accelerated(problem, settings));
-  if (!report.converged && contacts <= newton_contacts<dim>) go_on(solve_newton(problem, few));
+  const bool newton = !report.converged && contacts <= newton_contacts<dim>, narrow = newton && is_narrow(problem, contacts);
+  if (narrow) go_on(solve_newton(problem, few));
+  if (!report.converged && (contacts < few_contacts || settings.max_sweeps > local_sweeps)) go_on(solve_accelerated(problem, settings));
+  if (!report.converged && newton && !narrow) go_on(solve_newton(problem, few));
   if (!report.converged) go_on(solve_nlgs(problem, settings));
   return report;
 }

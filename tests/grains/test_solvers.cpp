@@ -99,6 +99,16 @@ TYPED_TEST(Solvers, a_column_at_rest_starts_from_its_solution_and_needs_few_roun
 }
 
 // A sub-step adds at most the error allowed to one contact, a share of the tolerance in diameters; repair keeps that from adding up.
+// Sweeps carry a force one layer at a time: thousands for 320 layers. Newton needs a handful, and W of a column factorises in O(n).
+TYPED_TEST(Solvers, a_tall_narrow_column_costs_some_newton_steps_and_no_thousands_of_sweeps) {
+  constexpr int dim = TypeParam::value;
+  auto sim = column<dim>(320);
+  sim.settings.solve.tolerance = 1e-8;
+  const auto report = sim.step(1e-3);
+  EXPECT_EQ(report.unconverged, 0);
+  EXPECT_LT(report.sweeps, 400);
+}
+
 TYPED_TEST(Solvers, overlaps_do_not_add_up_beyond_the_tolerance_in_diameters_however_loose_it_is) {
   constexpr int dim = TypeParam::value;
   for (Solver solver : {Solver::nlgs, Solver::active_set})
