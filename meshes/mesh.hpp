@@ -1,11 +1,13 @@
 // A simplex mesh with named regions and boundaries: data, and what can be said of it without a field. Where one comes from: gmsh.hpp,
-// shapes.hpp; how it is cut into parts: partition.hpp.
+// shapes.hpp; what is checked before there is one: assemble.hpp; how it is cut into parts: partition.hpp.
 #pragma once
 
 #include <Eigen/Core>
 
 #include <array>
 #include <string>
+#include <string_view>
+#include <type_traits>
 #include <vector>
 
 namespace quicksand::meshes {
@@ -34,8 +36,25 @@ struct Mesh {
 template <int dim>
 double volume(const Mesh<dim>& mesh, const std::array<int, dim + 1>& element);
 
+template <int dim>
+double volume(const Mesh<dim>& mesh);  // of all elements [m^dim]
+
 // Area of a facet times its unit normal [m^(dim-1)].
 template <int dim>
-Vec<dim> area_normal(const Mesh<dim>& mesh, const std::array<int, dim>& facet);
+Vec<dim> area_normal(const Mesh<dim>& mesh, const std::type_identity_t<std::array<int, dim>>& facet);  // identity: dim comes from the mesh
+
+// Index into boundary_names or region_names; std::invalid_argument that lists the names there are, and begins with `where`.
+template <int dim>
+int boundary_number(const Mesh<dim>& mesh, std::string_view name, std::string_view where);
+template <int dim>
+int region_number(const Mesh<dim>& mesh, std::string_view name, std::string_view where);
+
+// Area of all facets of a boundary [m^(dim-1)].
+template <int dim>
+double boundary_area(const Mesh<dim>& mesh, std::string_view name);
+
+// The facet of an element that has all its nodes but `corner`, its normal pointing out of the element.
+template <int dim>
+std::array<int, dim> outward_facet(const std::array<int, dim + 1>& element, int corner);
 
 }  // namespace quicksand::meshes
