@@ -53,6 +53,28 @@ def test_the_floor_of_the_cpp_example_carries_the_weight(prefix, tmp_path):
     assert abs(error) < 1e-9                      # rounding, summed over 1200 steps
 
 
+def test_a_program_may_use_the_meshes_and_one_that_does_not_needs_no_gmsh(prefix, tmp_path):
+    (tmp_path / "area.cpp").write_text("""
+        #include <quicksand/meshes/partition.hpp>
+        #include <quicksand/meshes/shapes.hpp>
+        #include <cstdio>
+        int main() {
+          const auto mesh = quicksand::meshes::annulus(1.0, 2.0, 0.1);
+          std::printf("%.2f %zu\\n", volume(mesh), partition(mesh, 3).size() / mesh.elements.size());
+        }""")
+    (tmp_path / "CMakeLists.txt").write_text("cmake_minimum_required(VERSION 3.25)\nproject(area LANGUAGES CXX)\n"
+                                             "find_package(quicksand REQUIRED COMPONENTS meshes)\n"
+                                             "add_executable(area area.cpp)\ntarget_link_libraries(area quicksand::meshes)\n")
+    configure = "cmake", "-G", "Ninja", "-S", tmp_path, f"-DCMAKE_PREFIX_PATH={prefix}"
+    run(*configure, "-B", tmp_path / "build")
+    run("cmake", "--build", tmp_path / "build")
+    assert run(tmp_path / "build" / "area") == "9.42 1\n"  # 3 pi
+
+    (tmp_path / "CMakeLists.txt").write_text("cmake_minimum_required(VERSION 3.25)\nproject(dry LANGUAGES CXX)\nfind_package(quicksand REQUIRED)\n"
+                                             "if(TARGET quicksand::meshes OR NOT TARGET quicksand::grains)\n  message(FATAL_ERROR no)\nendif()\n")
+    run(*configure, "-B", tmp_path / "dry", "-DCMAKE_DISABLE_FIND_PACKAGE_gmsh=ON")
+
+
 def test_one_version_everywhere():
     version, = re.findall(r"project\(quicksand VERSION (\S+)", (ROOT / "CMakeLists.txt").read_text())
     assert re.search(rf"^version: {re.escape(version)}$", (ROOT / "CITATION.cff").read_text(), re.M)
