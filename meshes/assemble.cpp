@@ -221,19 +221,22 @@ class Facets {
     }
   }
 
-  void check_boundary_is_named(bool any_name, const std::vector<bool>& on_period) const {
-    int unnamed = 0;
+  void check_boundary_is_named(const std::vector<bool>& on_period) const {
+    int boundary = 0, unnamed = 0;
     const Facet<dim>* first = nullptr;
-    for (const auto& facet : list)
-      if (facet.element[1] < 0 && facet.across < 0 && facet.group < 0 && unnamed++ == 0) first = &facet;
+    for (const auto& facet : list) {
+      if (facet.element[1] >= 0 || facet.across >= 0) continue;
+      ++boundary;
+      if (facet.group < 0 && unnamed++ == 0) first = &facet;
+    }
     if (unnamed == 0) return;
     const bool periodic = std::all_of(first->key.begin(), first->key.end(), [&](int node) { return on_period[node]; });
-    const char* hint = periodic   ? "it lies between nodes of periodic sides, which do not match there: mesh one side as a copy of the other"
-                       : any_name ? "name them, too; where they lie inside the domain two parts are not joined; periodic sides of a .msh 2.2 file "
-                                    "need a group for the file to keep the period"
-                                  : "name the parts of the boundary";
-    fail("{}: {} boundary facets are in no physical group, the first at {} m: {} (gmsh: Physical {}(\"wall\") = {{...}})", where_, unnamed,
-         place(at(*first)), hint, dim == 2 ? "Curve" : "Surface");
+    const char* hint =
+        periodic ? "it lies between nodes of periodic sides, which do not match there: mesh one side as a copy of the other"
+                 : "name every part of the boundary; inside the domain it is a gap between parts that are not joined; gmsh writes periodic "
+                   "sides to a .msh 2.2 file with a group only, to 4.1 always";
+    fail("{}: {} of {} boundary facets are in no physical group, the first at {} m: {} (gmsh: Physical {}(\"wall\") = {{...}})", where_, unnamed,
+         boundary, place(at(*first)), hint, dim == 2 ? "Curve" : "Surface");
   }
 
   std::vector<Facet<dim>> list;  // sorted by key
@@ -256,7 +259,8 @@ std::unordered_map<int, int> check_pairs(const Mesh<dim>& mesh, const Period<dim
     const Vec<dim> expected = mesh.nodes[m] + period.translation;
     const double error = (mesh.nodes[i] - expected).norm();
     if (!(error <= periodic_error * length))
-      fail("{}: periodic sides do not match: the image of the node at {} m should lie at {} m, and lies at {} m, {:.3g} m away (period {:.6g} m)",
+      fail("{}: periodic sides do not match: the image of the node at {} m should lie at {} m, and lies at {} m, {:.3g} m away (period {:.6g} m); "
+           "in a script, sides that run against each other need a minus: Periodic Curve {{2}} = {{-4}}",
            where, place(mesh.nodes[m]), place(expected), place(mesh.nodes[i]), error, length);
     const auto [known, is_new] = master.emplace(i, m);
     if (!is_new && known->second != m)
@@ -319,7 +323,7 @@ Mesh<dim> assemble(const Parts<dim>& parts, std::string_view where) {
     for (const auto& [image, original] : periods.back()) is_image[image] = on_period[image] = on_period[original] = true;
     facets.join(parts, period, periods.back());
   }
-  facets.check_boundary_is_named(!names.empty(), on_period);
+  facets.check_boundary_is_named(on_period);
   set_masters(mesh, periods, is_image);
   check_periods_are_long_enough(mesh, where);
 

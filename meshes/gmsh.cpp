@@ -8,10 +8,10 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <cstdlib>
 #include <fstream>
-#include <optional>
+#include <numeric>
 #include <set>
-#include <unordered_map>
 
 namespace quicksand::meshes {
 
@@ -42,7 +42,8 @@ double option(const char* name) {
   return value;
 }
 
-// gmsh 4.8 cannot be asked. Before the first initialize its calls leave their results as they were, after a finalize they throw.
+// gmsh 4.8 cannot be asked. Before the first initialize its calls leave their results as they were, after a finalize they throw (and print a
+// line, unless it was ours).
 bool is_alive() {
   try {
     return option("General.Terminal") != -1.0;
@@ -78,7 +79,10 @@ class Session {
       if (models_ > 0) gmsh::model::setCurrent(model_);
       for (auto it = before_.rbegin(); it != before_.rend(); ++it) gmsh::option::setNumber(it->first, it->second);
       if (!shared_log_) gmsh::logger::stop();
-      if (mine_) gmsh::finalize();
+      if (mine_) {
+        gmsh::option::setNumber("General.Verbosity", 0);  // else is_alive would print an error from now on
+        gmsh::finalize();
+      }
     } catch (...) {  // nothing that the caller could do
     }
   }
@@ -142,13 +146,6 @@ struct Elements {
   Elements(int dim, int tag) { gmsh::model::mesh::getElements(types, tags, nodes, dim, tag); }
 };
 
-std::vector<int> entities(int dim) {
-  gmsh::vectorpair found;
-  gmsh::model::getEntities(found, dim);
-  std::vector<int> tags;
-  for (const auto& [d, tag] : found) tags.push_back(tag);
-  return tags;
-}
 
 bool has_elements(int dim) {
   std::vector<int> types;
@@ -158,12 +155,16 @@ bool has_elements(int dim) {
 
 int dimension_of_mesh() { return has_elements(3) ? 3 : has_elements(2) ? 2 : has_elements(1) ? 1 : 0; }
 
-// Names of the physical groups that hold an entity; one without a name goes by its number.
-std::vector<std::string> groups_of(int dim, int tag) {
+std::vector<int> group_numbers(int dim, int tag) {
   std::vector<int> numbers;
   gmsh::model::getPhysicalGroupsForEntity(dim, tag, numbers);
+  return numbers;
+}
+
+// Names of the physical groups that hold an entity; one without a name goes by its number.
+std::vector<std::string> groups_of(int dim, int tag) {
   std::vector<std::string> names;
-  for (int number : numbers) {
+  for (int number : group_numbers(dim, tag)) {
     std::string name;
     gmsh::model::getPhysicalName(dim, number, name);
     names.push_back(name.empty() ? std::to_string(number) : name);
@@ -171,27 +172,46 @@ std::vector<std::string> groups_of(int dim, int tag) {
   return names;
 }
 
+// In the order of their groups, which becomes that of the names; without a group first.
+std::vector<int> entities(int dim) {
+  gmsh::vectorpair found;
+  gmsh::model::getEntities(found, dim);
+  std::vector<std::pair<std::vector<int>, int>> keys;
+  for (const auto& [d, tag] : found) keys.emplace_back(group_numbers(dim, tag), tag);
+  std::sort(keys.begin(), keys.end());
+  std::vector<int> tags;
+  for (const auto& [numbers, tag] : keys) tags.push_back(tag);
+  return tags;
+}
+
+// By their tags: gmsh's own order depends on the file that they come from.
 class Nodes {
  public:
   Nodes() {
-    std::vector<double> parameters;
-    gmsh::model::mesh::getNodes(tags_, x_, parameters);
-    for (std::size_t k = 0; k < tags_.size(); ++k) index_.emplace(tags_[k], static_cast<int>(k));
+    std::vector<std::size_t> tags;
+    std::vector<double> x, parameters;
+    gmsh::model::mesh::getNodes(tags, x, parameters);
+    std::vector<std::size_t> order(tags.size());
+    std::iota(order.begin(), order.end(), 0);
+    std::sort(order.begin(), order.end(), [&](auto a, auto b) { return tags[a] < tags[b]; });
+    for (std::size_t k : order) {
+      tags_.push_back(tags[k]);
+      x_.emplace_back(x[3 * k], x[3 * k + 1], x[3 * k + 2]);
+    }
   }
 
   std::size_t size() const { return tags_.size(); }
-  Vec<3> operator[](std::size_t k) const { return Eigen::Map<const Vec<3>>(&x_[3 * k]); }
+  const Vec<3>& operator[](std::size_t k) const { return x_[k]; }
 
   int index(std::size_t tag, std::string_view where) const {
-    const auto found = index_.find(tag);
-    if (found == index_.end()) fail("{}: node {} is used and not defined", where, tag);
-    return found->second;
+    const auto found = std::lower_bound(tags_.begin(), tags_.end(), tag);
+    if (found == tags_.end() || *found != tag) fail("{}: node {} is used and not defined", where, tag);
+    return static_cast<int>(found - tags_.begin());
   }
 
  private:
-  std::vector<std::size_t> tags_;
-  std::vector<double> x_;
-  std::unordered_map<std::size_t, int> index_;
+  std::vector<std::size_t> tags_;  // ascending
+  std::vector<Vec<3>> x_;          // [m]
 };
 
 // Simplices of an entity of dimension n - 1.
@@ -231,26 +251,70 @@ std::string side_of(int tag) {
   return fmt::format("{} {}", dim == 2 ? "curve" : "surface", tag);
 }
 
-// The period between a side and its master, if it has one. Without a transformation in the file the first pair of nodes gives it.
+// A side and the one it is an image of, in gmsh's numbers.
+struct PeriodicSide {
+  int dim, tag, master;
+  std::vector<std::size_t> images, originals;  // nodes
+  std::vector<double> affine;                  // 4 x 4, or empty
+};
+
+std::vector<PeriodicSide> periodic_sides(int dim) {
+  std::vector<PeriodicSide> sides;
+  for (int tag : entities(dim)) {
+    PeriodicSide side{.dim = dim, .tag = tag, .master = tag, .images = {}, .originals = {}, .affine = {}};
+    gmsh::model::mesh::getPeriodicNodes(dim, tag, side.master, side.images, side.originals, side.affine);
+    if (side.master != tag && !side.images.empty()) sides.push_back(std::move(side));
+  }
+  return sides;
+}
+
+// gmsh 4.8 writes the periodic sides of a .msh 2.2 file, as text in binary files too, and does not read them. Nothing for other versions.
+std::vector<PeriodicSide> periodic_sides_of_old_file(const std::filesystem::path& path, std::string_view where) {
+  std::ifstream file(path, std::ios::binary);
+  std::string line;
+  while (std::getline(file, line) && !line.starts_with("$MeshFormat")) {}
+  if (!std::getline(file, line) || !line.starts_with("2")) return {};
+  while (std::getline(file, line) && !line.starts_with("$Periodic")) {}
+  std::vector<PeriodicSide> sides;
+  std::size_t count = 0;
+  if (!file || !(file >> count)) return {};
+  for (std::size_t s = 0; s < count; ++s) {
+    PeriodicSide side;
+    std::string word;
+    file >> side.dim >> side.tag >> side.master >> word;
+    if (word == "Affine") {
+      side.affine.resize(16);
+      for (double& x : side.affine) file >> x;
+      file >> word;
+    }
+    std::size_t image = 0, original = 0;
+    for (long n = file ? std::strtol(word.c_str(), nullptr, 10) : 0; n > 0 && file >> image >> original; --n) {
+      side.images.push_back(image);
+      side.originals.push_back(original);
+    }
+    if (!file) fail("{}: its $Periodic section ends in the middle, at entry {} of {}", where, s + 1, count);
+    if (!side.images.empty()) sides.push_back(std::move(side));
+  }
+  return sides;
+}
+
+// Without a transformation the translation is the mean over the pairs.
 template <int dim>
-std::optional<Period<dim>> period(int tag, const Nodes& nodes, std::string_view where) {
-  int master = tag;
-  std::vector<std::size_t> images, originals;
-  std::vector<double> affine;
-  gmsh::model::mesh::getPeriodicNodes(dim - 1, tag, master, images, originals, affine);
-  if (master == tag || images.empty()) return {};
-  Period<dim> result{.translation = Vec<dim>::Zero(), .pairs = {}, .images = {tag}, .masters = {master}};
-  for (std::size_t k = 0; k < images.size(); ++k)
-    result.pairs.push_back({nodes.index(images[k], where), nodes.index(originals[k], where)});
-  Vec<3> translation = nodes[result.pairs[0][0]] - nodes[result.pairs[0][1]];
-  if (affine.size() == 16) {
-    const Eigen::Map<const Eigen::Matrix<double, 4, 4, Eigen::RowMajor>> map(affine.data());
+Period<dim> period(const PeriodicSide& side, const Nodes& nodes, std::string_view where) {
+  Period<dim> result{.translation = Vec<dim>::Zero(), .pairs = {}, .images = {side.tag}, .masters = {side.master}};
+  Vec<3> translation = Vec<3>::Zero();
+  for (std::size_t k = 0; k < side.images.size(); ++k) {
+    const auto& pair = result.pairs.emplace_back(std::array{nodes.index(side.images[k], where), nodes.index(side.originals[k], where)});
+    translation += (nodes[pair[0]] - nodes[pair[1]]) / static_cast<double>(side.images.size());
+  }
+  if (!side.affine.empty()) {
+    const Eigen::Map<const Eigen::Matrix<double, 4, 4, Eigen::RowMajor>> map(side.affine.data());
     if (!(map.topLeftCorner<3, 3>() - Eigen::Matrix3d::Identity()).isZero(1e-9))
-      fail("{}: {} is a turned or mirrored image of {}; a period must be a translation", where, side_of<dim>(tag), side_of<dim>(master));
+      fail("{}: {} is a turned or mirrored image of {}; a period must be a translation", where, side_of<dim>(side.tag), side_of<dim>(side.master));
     translation = map.topRightCorner<3, 1>();
   }
   if (dim == 2 && !(std::abs(translation.z()) <= 1e-9 * translation.norm()))
-    fail("{}: the period of {} leaves the plane: its z must be 0 m, got {} m", where, side_of<dim>(tag), translation.z());
+    fail("{}: the period of {} leaves the plane: its z must be 0 m, got {} m", where, side_of<dim>(side.tag), translation.z());
   result.translation = translation.template head<dim>();
   return result;
 }
@@ -262,12 +326,14 @@ void check_plane(const Parts<2>& parts, const Nodes& nodes, std::string_view whe
     for (const auto& triangle : body.simplices)
       for (int k : triangle)
         if (!(std::abs(nodes[k].z()) <= 1e-9 * extent))  // rounding of the generator's geometry
-          fail("{}: a mesh in 2D lies in the plane z = 0 m, the node at {} m does not; is this the surface of a body in 3D?", where,
+          fail("{}: a mesh in 2D lies in the plane z = 0 m, the node at {} m does not; is this the surface of a body in 3D? (A .msh "
+               "file holds physical groups only, when there are some: the body needs one, too.)", where,
                place(nodes[k]));
 }
 
+// `sides`: where not gmsh but a file knows the periodic ones.
 template <int dim>
-Mesh<dim> mesh_of_model(std::string_view where) {
+Mesh<dim> mesh_of_model(std::string_view where, std::vector<PeriodicSide> sides = {}) {
   const int found = dimension_of_mesh();
   if (found != dim && found < 2) fail("{}: there is no {} in this mesh", where, dim == 2 ? "triangle" : "tetrahedron");
   if (found != dim) fail("{}: this is a mesh in {}D, not in {}D", where, found, dim);
@@ -285,20 +351,21 @@ Mesh<dim> mesh_of_model(std::string_view where) {
   if constexpr (dim == 2) check_plane(parts, nodes, where);
 
   std::set<int> periodic;
-  for (int tag : entities(dim - 1)) {
-    auto joined = period<dim>(tag, nodes, where);
-    if (!joined) continue;
-    periodic.insert({tag, joined->masters[0]});
+  if (sides.empty()) sides = periodic_sides(dim - 1);
+  for (const auto& side : sides) {
+    if (side.dim != dim - 1) continue;
+    auto joined = period<dim>(side, nodes, where);
+    periodic.insert({side.tag, side.master});
     // Sides of the same period are one: at their rims each may need the pairs of the others.
     const auto same = std::find_if(parts.periods.begin(), parts.periods.end(), [&](const auto& other) {
-      return (other.translation - joined->translation).norm() <= 1e-9 * joined->translation.norm();
+      return (other.translation - joined.translation).norm() <= 1e-9 * joined.translation.norm();
     });
     if (same == parts.periods.end()) {
-      parts.periods.push_back(std::move(*joined));
+      parts.periods.push_back(std::move(joined));
     } else {
-      same->pairs.insert(same->pairs.end(), joined->pairs.begin(), joined->pairs.end());
-      same->images.push_back(tag);
-      same->masters.push_back(joined->masters[0]);
+      same->pairs.insert(same->pairs.end(), joined.pairs.begin(), joined.pairs.end());
+      same->images.push_back(side.tag);
+      same->masters.push_back(side.master);
     }
   }
   for (int tag : entities(dim - 1)) {
@@ -308,9 +375,9 @@ Mesh<dim> mesh_of_model(std::string_view where) {
   return assemble(parts, where);
 }
 
-AnyMesh any_mesh_of_model(std::string_view where) {
-  if (dimension_of_mesh() == 3) return mesh_of_model<3>(where);
-  return mesh_of_model<2>(where);
+AnyMesh any_mesh_of_model(std::string_view where, std::vector<PeriodicSide> sides = {}) {
+  if (dimension_of_mesh() == 3) return mesh_of_model<3>(where, std::move(sides));
+  return mesh_of_model<2>(where, std::move(sides));
 }
 
 // Without a newline at its end gmsh would leave out the last line of a script, and say nothing.
@@ -342,7 +409,7 @@ auto with_file(const std::filesystem::path& path, int dim, Take&& take) {
       gmsh::model::mesh::generate(dim ? dim : gmsh::model::getDimension());
       session.check();
     }
-    auto mesh = take(where);
+    auto mesh = take(where, is_script ? std::vector<PeriodicSide>() : periodic_sides_of_old_file(path, where));
     session.check();
     return mesh;
   });
@@ -368,7 +435,7 @@ auto with_current_model(Take&& take) {
 
 template <int dim>
 Mesh<dim> read_mesh(const std::filesystem::path& path) {
-  return with_file(path, dim, [](std::string_view where) { return mesh_of_model<dim>(where); });
+  return with_file(path, dim, mesh_of_model<dim>);
 }
 
 AnyMesh read_mesh(const std::filesystem::path& path) { return with_file(path, 0, any_mesh_of_model); }
@@ -378,7 +445,9 @@ Mesh<dim> current_model() {
   return with_current_model([](std::string_view where) { return mesh_of_model<dim>(where); });
 }
 
-AnyMesh current_model() { return with_current_model(any_mesh_of_model); }
+AnyMesh current_model() {
+  return with_current_model([](std::string_view where) { return any_mesh_of_model(where); });
+}
 
 template <int dim>
 Mesh<dim> mesh_by_gmsh(std::string_view where, double size, const std::function<void()>& draw) {

@@ -133,8 +133,8 @@ PYBIND11_MODULE(_meshes, m) {
 
 Physical groups of dimension dim are the regions; if there are any, elements outside of them are left out, if there are none, all
 elements are the region 'domain'. Physical groups of dimension dim - 1 are the boundaries: every facet on the boundary must be in one,
-those of periodic sides excepted. A group without a name goes by its number, two groups of the same name are one. A named facet inside
-the mesh keeps the direction it has in gmsh.
+those of periodic sides excepted. A group without a name goes by its number (gmsh gives a name to one group only: a second one of
+the same name has none). A named facet inside the mesh keeps the direction it has in gmsh.
 
 A gmsh session that is alive in this process keeps its models and options, but for options that a .geo script sets.
 

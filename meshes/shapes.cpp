@@ -28,7 +28,7 @@ int count(double length, double size) { return std::max(1, static_cast<int>(std:
 
 void check_size(double size, double largest, std::string_view where, std::string_view why, double elements) {
   check_length(size, where, "size");
-  if (size > largest * (1 + 1e-12)) fail("{}: size must be <= {:.6g} m, {}, got {} m", where, largest, why, size);
+  if (size > largest * (1 + 1e-12)) fail("{}: size must be <= {:.6g} m ({}), got {} m", where, largest, why, size);
   if (elements > most_elements) fail("{}: size {} m would make {:.1e} elements, more than {:.0e}; choose a larger one", where, size, elements, most_elements);
 }
 
@@ -144,6 +144,10 @@ std::vector<int> add_circle(const Vec<2>& centre, double radius) {
   return arcs;
 }
 
+void divide(const std::vector<int>& arcs, double radius, double size) {
+  for (int arc : arcs) gmsh::model::mesh::setTransfiniteCurve(arc, count(std::numbers::pi / 2 * radius, size) + 1);
+}
+
 std::vector<double> shift(int axis, double length) {
   std::vector<double> affine{1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
   affine[4 * axis + 3] = length;
@@ -172,7 +176,7 @@ Mesh<dim> box(const Box<dim>& box, double size) {
     elements *= box.lengths[a] / size;
     if (box.periodic[a]) shortest = std::min(shortest, box.lengths[a] / 2);
   }
-  check_size(size, shortest, "box", "the shortest side, half of it where it is periodic", 2 * (dim == 3 ? 3 : 1) * elements);
+  check_size(size, shortest, "box", "the shortest side, half of a periodic one", 2 * (dim == 3 ? 3 : 1) * elements);
   return mesh_by_gmsh<dim>("box", size, [&] {
     const Vec<dim> high = box.origin + box.lengths;
     std::array<int, 2 * dim> sides;  // in the order of their names
@@ -197,7 +201,7 @@ Mesh<dim> box(const Box<dim>& box, double size) {
 Mesh<2> channel(double length, double height, double size, bool periodic) {
   check_length(length, "channel", "length");
   check_length(height, "channel", "height");
-  check_size(size, std::min(height, periodic ? length / 2 : length), "channel", "the height and the length, half of it where it is periodic",
+  check_size(size, std::min(height, periodic ? length / 2 : length), "channel", "the height and the length, half of a periodic one",
              2 * length * height / (size * size));
   return grid<2>({.lengths = {length, height}, .periodic = {periodic, false}}, {count(length, size), count(height, size)},
                  {"inflow", "outflow", "walls", "walls"}, "channel");
@@ -226,7 +230,7 @@ Mesh<2> cylinder_in_channel(double size, const CylinderInChannel& shape) {
     name(1, {right}, "outflow");
     name(1, {bottom, top}, "walls");
     name(1, circle, "cylinder");
-    for (int arc : circle) gmsh::model::mesh::setTransfiniteCurve(arc, count(std::numbers::pi / 2 * radius, size) + 1);
+    divide(circle, radius, size);
     const int field = gmsh::model::mesh::field::add("MathEval");
     gmsh::model::mesh::field::setString(field, "F", fmt::format("{} + 0.2*(Sqrt((x-({}))^2 + (y-({}))^2) - {})", size, shape.centre.x(), shape.centre.y(), radius));
     gmsh::model::mesh::field::setAsBackgroundMesh(field);
@@ -239,17 +243,18 @@ namespace {
 Mesh<2> ring(std::string_view where, double inner, double outer, double size) {
   return mesh_by_gmsh<2>(where, size, [&] {
     namespace geo = gmsh::model::geo;
-    std::vector<int> loops;
-    for (const auto& [radius, group] : {std::pair{outer, "outer"}, std::pair{inner, "inner"}}) {
-      if (radius == 0) continue;
-      const auto circle = add_circle(Vec<2>::Zero(), radius);
-      loops.push_back(geo::addCurveLoop(circle));
-      geo::synchronize();
-      name(1, circle, group);
-      for (int arc : circle) gmsh::model::mesh::setTransfiniteCurve(arc, count(std::numbers::pi / 2 * radius, size) + 1);
+    std::vector<std::vector<int>> circles{add_circle(Vec<2>::Zero(), outer)};
+    std::vector<int> loops{geo::addCurveLoop(circles[0])};
+    if (inner > 0) {
+      circles.push_back(add_circle(Vec<2>::Zero(), inner));
+      loops.push_back(geo::addCurveLoop(circles[1]));
     }
     geo::addPlaneSurface(loops);
     geo::synchronize();
+    for (std::size_t k = 0; k < circles.size(); ++k) {
+      name(1, circles[k], k == 0 ? "outer" : "inner");
+      divide(circles[k], k == 0 ? outer : inner, size);
+    }
   });
 }
 
@@ -266,7 +271,7 @@ Mesh<2> annulus(double inner, double outer, double size) {
 Mesh<3> pipe(double radius, double length, double size, bool periodic) {
   check_length(radius, "pipe", "radius");
   check_length(length, "pipe", "length");
-  check_size(size, std::min(radius, periodic ? length / 2 : length), "pipe", "the radius and the length, half of it where it is periodic",
+  check_size(size, std::min(radius, periodic ? length / 2 : length), "pipe", "the radius and the length, half of a periodic one",
              22 * radius * radius * length / (size * size * size));
   const Mesh<2> disc = ring("pipe", 0, radius, size);
   const int layers = count(length, size), n = static_cast<int>(disc.nodes.size());
