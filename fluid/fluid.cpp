@@ -296,13 +296,6 @@ void Fluid<dim>::hold(double t) {
     held = {};
     has_frame_[node] = false;
     const double eps = eps_[0][node];
-    const Held1* all = nullptr;
-    for (const Held1& say : says[node])
-      if ((say.kind == Kind::wall || say.kind == Kind::inflow) && (!all || say.turn > all->turn)) all = &say;
-    if (all) {
-      held.last = dim, held.value = eps * all->value;
-      continue;
-    }
     auto add = [&](const Vec<dim>& direction, const Vec<dim>& velocity) {
       Vec<dim> rest = direction.normalized();
       for (int k = 0; k < held.last; ++k) rest -= rest.dot(held.frame.col(k)) * held.frame.col(k);
@@ -311,6 +304,20 @@ void Fluid<dim>::hold(double t) {
       held.frame.col(held.last) = rest;
       held.value[held.last++] = eps * velocity.dot(rest);
     };
+    // Walls and inflows hold everything. Where several meet, each says what crosses it, so that none leaks, and the last one set the rest.
+    std::sort(says[node].begin(), says[node].end(), [](const Held1& a, const Held1& b) { return a.turn > b.turn; });
+    const Held1* all = nullptr;
+    for (const Held1& say : says[node])
+      if (say.kind == Kind::wall || say.kind == Kind::inflow) {
+        for (const Vec<dim>& normal : say.normals) add(normal, say.value);
+        if (!all) all = &say;
+      }
+    if (all) {
+      for (int axis = 0; axis < dim; ++axis) add(Vec<dim>::Unit(axis), all->value);
+      held.value = held.frame * held.value;
+      held.frame.setIdentity();
+      continue;
+    }
     Vec<dim> with_mesh = mesh_velocity_[space_.between[node][0]];
     with_mesh = 0.5 * (with_mesh + mesh_velocity_[space_.between[node][1]]);
     for (const Held1& say : says[node])

@@ -54,7 +54,8 @@ class Fluid {
   Properties<dim> properties;
   Settings settings;
 
-  // Velocities are those of the fluid, u = U/eps. Where two boundaries meet, a wall or inflow holds all components; of two, the one set last.
+  // Velocities are those of the fluid, u = U/eps. Where boundaries meet, walls and inflows come first; each of them says what crosses it, and
+  // the one set last the rest.
   void set_wall(const std::string& boundary, VectorField<dim> velocity);
   void set_inflow(const std::string& boundary, VectorField<dim> velocity);
   void set_slip(const std::string& boundary);
