@@ -607,8 +607,11 @@ std::vector<double> Fluid<dim>::solve(const char* function, const std::vector<do
     }
   }
   if (!solver_) {
-    LinearSettings linear = settings.linear.value_or(LinearSettings{.method = dim == 3 && velocity_order() == 1 ? Method::ilu : Method::direct});
-    solver_ = std::make_unique<LinearSolver>(space_.begin, space_.end, space_.dofs(), space_.row_start, space_.column, linear);
+    LinearSettings linear = settings.linear.value_or(LinearSettings{.method = dim == 2 ? Method::direct : velocity_order() == 1 ? Method::ilu : Method::fieldsplit});
+    std::vector<int> pressures;
+    for (int k = space_.begin; k < space_.end; ++k)
+      if (is_pressure[k]) pressures.push_back(k);
+    solver_ = std::make_unique<LinearSolver>(space_.begin, space_.end, space_.dofs(), space_.row_start, space_.column, linear, velocity_order() == 1 ? dim + 1 : 1, pressures);
   }
   std::vector<double> change(space_.dofs(), 0.0);
   const LinearReport linear = solver_->solve(values, missing, std::span(change).subspan(space_.begin, own));
@@ -705,7 +708,7 @@ Report Fluid<dim>::step(double dt) {
   hold(t);
   evaluate_outside(t);
   for (int k = 0; k < space_.dofs(); ++k) guess_[k] = x_[0][k] + (second ? r * (x_[0][k] - x_[1][k]) : 0.0);
-  std::vector<double> x = x_[0];
+  std::vector<double> x = guess_;
   const bool newton = settings.advection == Advection::newton;
   for (int k = 0;; ++k) {
     std::vector<double> next = solve("step", x, time, newton && k > 0, report);

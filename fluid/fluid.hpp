@@ -33,7 +33,7 @@ struct Settings {
   Scheme scheme = Scheme::bdf2;
   double newton_tolerance = 1e-9;  // change of the last iteration, relative to the solution, in U and in p
   int max_newton = 30;
-  std::optional<LinearSettings> linear;  // none: direct in 2D, ILU in 3D with order 1
+  std::optional<LinearSettings> linear;  // none: direct in 2D; in 3D ilu with order 1, fieldsplit with order 2
 };
 
 struct Report {

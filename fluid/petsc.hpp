@@ -22,12 +22,13 @@ void share(std::vector<double>& x, const std::vector<int>& first);
 
 enum class Method {
   direct,    // MUMPS; its factors serve on as a preconditioner of GMRES while few iterations are enough
-  ilu,       // GMRES with ILU(0) of each rank's rows
+  ilu,       // GMRES with ILU(0) of each rank's blocks of a node's unknowns
+  fieldsplit,  // flexible GMRES; velocity by ILU(0), pressure by multigrid on A_pu diag(A_uu)^-1 A_up (SELFP)
 };
 
 struct LinearSettings {
   Method method = Method::direct;
-  double tolerance = 1e-10;     // on the residual, preconditioned, relative to that of the right-hand side [-]
+  double tolerance = 1e-10;     // on the residual, preconditioned, relative to the first one of this system or of recent ones [-]
   int max_iterations = 1000;
   int most_with_old_factors = 8;  // iterations: more, and the next matrix is factorised anew
 };
@@ -42,9 +43,10 @@ struct LinearReport {
 
 class LinearSolver {
  public:
-  // Rows begin ... end - 1 of `size` are this rank's; columns ascend in each row.
+  // Rows begin ... end - 1 of `size` are this rank's; columns ascend in each row. With ilu, rows come in blocks of `block` that have the same
+  // columns; fieldsplit needs to know which of this rank's rows are pressures.
   LinearSolver(int begin, int end, int size, const std::vector<int>& row_start, const std::vector<int>& column, LinearSettings settings,
-               const std::string& prefix = "");
+               int block = 1, const std::vector<int>& pressures = {}, const std::string& prefix = "");
   ~LinearSolver();
   // x of this rank's rows from 0; `values` along row_start and column. Numbers that differ between ranks: the same report on all.
   LinearReport solve(std::span<const double> values, std::span<const double> b, std::span<double> x);

@@ -213,6 +213,12 @@ void add_fluid(py::module_& m, const char* name) {
       .def_property("scheme", [](const F& f) { return f.settings.scheme == Scheme::bdf2 ? "bdf2" : "backward_euler"; },
                     [](F& f, const std::string& name) { f.settings.scheme = one_of<Scheme>("scheme", name, {{"bdf2", Scheme::bdf2}, {"backward_euler", Scheme::backward_euler}}); },
                     "\"bdf2\" (its first step is backward Euler) or \"backward_euler\"")
+      .def_property("solver", [](const F& f) { return f.settings.linear ? (f.settings.linear->method == Method::direct ? "direct" : f.settings.linear->method == Method::ilu ? "ilu" : "fieldsplit") : "auto"; },
+                    [](F& f, const std::string& name) {
+                      if (name == "auto") f.settings.linear.reset();
+                      else f.settings.linear = LinearSettings{.method = one_of<Method>("solver", name, {{"direct", Method::direct}, {"ilu", Method::ilu}, {"fieldsplit", Method::fieldsplit}})};
+                    },
+                    "of the linear systems, before the first step: \"direct\" (MUMPS), \"ilu\", \"fieldsplit\", or \"auto\": direct in 2D, in 3D ilu for p1p1 and fieldsplit for p2p1")
       .def_property("newton_tolerance", [](const F& f) { return f.settings.newton_tolerance; }, [](F& f, double v) { f.settings.newton_tolerance = v; })
       .def_property("max_newton", [](const F& f) { return f.settings.max_newton; }, [](F& f, int v) { f.settings.max_newton = v; });
 }
