@@ -45,7 +45,7 @@ std::string describe(const Mesh<dim>& mesh) {
 template <int dim>
 void bind(py::module_& m) {
   using M = Mesh<dim>;
-  py::class_<M>(m, fmt::format("Mesh{}D", dim).c_str(), R"(A mesh of triangles (2D) or tetrahedra (3D) with named regions and boundaries.
+  py::class_<M, std::shared_ptr<M>>(m, fmt::format("Mesh{}D", dim).c_str(), R"(A mesh of triangles (2D) or tetrahedra (3D) with named regions and boundaries.
 
 Made by `read`, `current_model` or a shape. Arrays are copies of what the mesh holds. Volumes are areas in 2D, areas are lengths.)")
       .def_property_readonly_static("dim", [](const py::object&) { return dim; })

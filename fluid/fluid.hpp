@@ -1,0 +1,173 @@
+// Volume-averaged flow on a simplex mesh: conditions on named boundaries, void fraction, a distributed reaction, steps in time and steady
+// states. Equations: equations.hpp; unknowns: space.hpp. Every rank calls every function, in the same order.
+#pragma once
+
+#include "petsc.hpp"
+#include "space.hpp"
+
+#include <functional>
+#include <optional>
+#include <stdexcept>
+
+namespace quicksand::fluid {
+
+// Values at points and a time [s]; called with all points at once.
+template <int dim>
+using VectorField = std::function<std::vector<Vec<dim>>(std::span<const Vec<dim>> x, double t)>;
+template <int dim>
+using ScalarField = std::function<std::vector<double>(std::span<const Vec<dim>> x, double t)>;
+
+enum class Advection {
+  none,          // Stokes
+  extrapolated,  // by a velocity known before the step: one linear system a step
+  newton,        // to `newton_tolerance`
+};
+enum class Scheme { backward_euler, bdf2 };
+
+struct NotConverged : std::runtime_error {
+  using std::runtime_error::runtime_error;
+};
+
+struct Settings {
+  Advection advection = Advection::extrapolated;
+  Scheme scheme = Scheme::bdf2;
+  double newton_tolerance = 1e-9;  // change of the last iteration, relative to the solution, in U and in p
+  int max_newton = 30;
+  std::optional<LinearSettings> linear;  // none: direct in 2D; in 3D ilu with order 1, fieldsplit with order 2
+};
+
+struct Report {
+  int newton_iterations = 0, linear_iterations = 0, factorisations = 0;
+  double change = 0.0;           // of the last Newton iteration
+  double net_inflow = 0.0;       // through all boundaries relative to the mesh [m^dim/s]
+  double pore_volume_rate = 0.0; // d/dt of int eps over the domain [m^dim/s]
+  double volume_error = 0.0;     // of their balance, relative to the fastest flow through all of the boundary and all changes of eps [-]
+  double assembly_time = 0.0, solve_time = 0.0;  // [s]
+};
+
+template <int dim>
+class Fluid {
+ public:
+  Fluid(std::shared_ptr<const Mesh<dim>> mesh, int order, Properties<dim> properties);
+  ~Fluid();
+
+  Properties<dim> properties;
+  Settings settings;
+
+  // Velocities are those of the fluid, u = U/eps. Where boundaries meet, walls and inflows come first; each of them says what crosses it, and
+  // the one set last the rest.
+  void set_wall(const std::string& boundary, VectorField<dim> velocity);
+  void set_inflow(const std::string& boundary, VectorField<dim> velocity);
+  void set_slip(const std::string& boundary);
+  // The traction is -p n. Fluid that enters against the flow brings no momentum.
+  void set_outflow(const std::string& boundary, ScalarField<dim> pressure);
+  // Lets fluid through: tangential velocity of the plate, traction -p n along the normal; entering fluid has the plate's velocity.
+  void set_permeable(const std::string& boundary, VectorField<dim> velocity, ScalarField<dim> pressure);
+  // Where no boundary knows the pressure its mean is 0, or this [Pa].
+  void set_mean_pressure(double pressure);
+
+  // Of the coming step, at the nodes of the mesh or at all of nodes(): in (0, 1].
+  void set_void_fraction(std::span<const double> eps);
+  // Flux and pressure to start from; also the past of the first step.
+  void set_velocity(std::span<const Vec<dim>> u);
+  void set_pressure(std::span<const double> p);
+  // At quadrature_points(), element by element; empty: none.
+  void set_reaction(std::vector<Reaction<dim>> reaction);
+  std::vector<Vec<dim>> quadrature_points() const;
+
+  Report step(double dt);
+  Report solve_steady();
+
+  double time() const { return time_; }
+  const Mesh<dim>& mesh() const { return *mesh_; }
+  const Space<dim>& space() const { return space_; }
+  int velocity_order() const { return space_.order; }
+  // Nodes of the mesh, then with order 2 the middles of edges [m]; values there.
+  std::vector<Vec<dim>> nodes() const;
+  std::vector<Vec<dim>> velocity() const;      // u [m/s]
+  std::vector<double> void_fraction() const;
+  std::vector<double> pressure() const;        // at the nodes of the mesh [Pa]
+
+  // Of the fluid on a boundary [N] (2D: N/m): pressure, and the viscous traction as the momentum balance has it.
+  Vec<dim> force(const std::string& boundary) const;
+  // int U . n along a named boundary, or named facets inside [m^dim/s]; relative to the mesh when that moves.
+  double flux(const std::string& boundary) const;
+  struct Probe {
+    Vec<dim> velocity;
+    double pressure;
+    Vec<dim> pressure_gradient;
+  };
+  std::vector<Probe> probe(std::span<const Vec<dim>> x) const;
+  // Relative L2 errors against a known flow, by a rule of degree 4 or more.
+  struct Error {
+    double velocity, pressure;
+  };
+  Error error(const VectorField<dim>& velocity, const ScalarField<dim>& pressure) const;
+
+ private:
+  enum class Kind { none, wall, inflow, slip, outflow, permeable };
+  struct Condition {
+    Kind kind = Kind::none;
+    int turn = 0;  // of setting
+    VectorField<dim> velocity;
+    ScalarField<dim> pressure;
+  };
+  struct Held {  // of a velocity node
+    Mat<dim> frame = Mat<dim>::Identity();  // its axes as columns
+    int first = 0, last = 0;                // held axes: first ... last - 1
+    Vec<dim> value = Vec<dim>::Zero();      // of U along them
+  };
+
+  int boundary_index(const char* function, const std::string& name) const;
+  Condition& condition(const char* function, const std::string& name, Kind kind);
+  void check_conditions(const char* function) const;
+  bool has_pressure_reference() const;
+  void hold(double t);
+  void evaluate_outside(double t);
+  template <int order>
+  ElementInput<dim, order> input(int element) const;
+  template <int order>
+  void scatter(int local, const ElementSystem<dim, order>& system);
+  template <int order>
+  void assemble(const TimeWeights& time, bool newton);
+  template <int order>
+  void add_boundaries();
+  std::vector<double> solve(const char* function, const std::vector<double>& start, const TimeWeights& time, bool newton, Report& report);
+  std::vector<double> times_matrix(const std::vector<double>& x) const;
+  std::vector<double> eps_change(double dt) const;
+  std::vector<int> node_numbers() const;
+  std::vector<std::pair<int, Vec<dim>>> facet_nodes(int facet) const;
+  Vec<dim> velocity_in(int element, const Barycentric<dim>& l) const;
+  void spread_surplus(const char* function, const std::vector<double>& x, const TimeWeights& time, std::vector<double>& missing) const;
+  double mean_pressure(const std::vector<double>& x) const;
+  double relative_change(const std::vector<double>& x, const std::vector<double>& before) const;
+  double flux_of(const std::vector<double>& x, int boundary) const;
+  void account(Report& report, const std::vector<double>& x, const TimeWeights& time) const;
+  [[noreturn]] void throw_newton(const char* function, const Report& report) const;
+
+  std::shared_ptr<const Mesh<dim>> mesh_;
+  Space<dim> space_;
+  std::vector<Condition> conditions_;  // of each boundary
+  int turns_ = 0;
+  std::optional<double> mean_pressure_;
+  std::vector<Vec<dim>> position_, old_position_;  // of mesh nodes, now and at the start of the step
+  std::vector<Vec<dim>> mesh_velocity_;            // of mesh nodes
+  std::array<std::vector<double>, 3> eps_;         // at velocity nodes: now, one and two steps ago
+  std::array<std::vector<double>, 2> x_;           // unknowns, Cartesian, after the last step and the one before
+  std::vector<double> guess_;                      // that advects
+  std::vector<double> eps_change_, old_eps_change_;  // int q (change of eps at a fixed point) of a step, per vertex [m^dim]
+  std::vector<Reaction<dim>> reaction_;
+  std::vector<Held> held_;
+  std::vector<char> has_frame_;
+  std::vector<std::vector<double>> outer_pressure_;  // per boundary, at the facets' quadrature points
+  std::vector<std::vector<Vec<dim>>> outer_velocity_;
+  std::vector<std::vector<int>> facets_of_;          // of each boundary
+  std::vector<double> values_, b_;                   // this rank's rows, before conditions
+  std::vector<double> reaction_at_nodes_;            // A x - b: what holds the held unknowns
+  std::unique_ptr<LinearSolver> solver_;
+  double time_ = 0.0, dt_ = 0.0;
+  int steps_ = 0;
+  bool eps_started_ = false;
+};
+
+}  // namespace quicksand::fluid
