@@ -769,6 +769,57 @@ std::vector<double> Fluid<dim>::solve_step(double t, const TimeWeights& time, Re
   }
 }
 
+// Calls visit(doubles) for every part of the state.
+template <int dim>
+template <class Visit>
+void Fluid<dim>::each_part(Visit&& visit) {
+  double steps = steps_, started = eps_started_;
+  for (double* one : {&time_, &dt_, &steps, &started}) visit(std::span(one, 1));
+  steps_ = static_cast<int>(steps), eps_started_ = started != 0.0;
+  for (auto* many : {&x_[0], &x_[1], &eps_[0], &eps_[1], &eps_[2], &eps_change_, &old_eps_change_, &swept_, &old_swept_, &old_swept_used_}) visit(std::span(*many));
+  visit(std::span(pore_volume_));
+  visit(std::span(time_weights_));
+  for (auto* points : {&position_, &mesh_velocity_}) visit(std::span(points->data()->data(), dim * points->size()));
+}
+
+// What a state must agree with: 53 bits of FNV-1a over the element, the mesh's nodes and how they are connected.
+template <int dim>
+static double fingerprint(const Space<dim>& space) {
+  std::uint64_t hash = 14695981039346656037ull;
+  auto add = [&](const void* data, std::size_t bytes) {
+    for (std::size_t k = 0; k < bytes; ++k) hash = (hash ^ static_cast<const unsigned char*>(data)[k]) * 1099511628211ull;
+  };
+  const Mesh<dim>& mesh = *space.mesh;
+  add(&space.order, sizeof space.order);
+  add(mesh.nodes.data(), mesh.nodes.size() * sizeof mesh.nodes[0]);
+  add(mesh.elements.data(), mesh.elements.size() * sizeof mesh.elements[0]);
+  add(mesh.master.data(), mesh.master.size() * sizeof mesh.master[0]);
+  return static_cast<double>(hash >> 11);
+}
+
+template <int dim>
+std::vector<double> Fluid<dim>::state() {
+  std::vector<double> all{fingerprint(space_)};
+  each_part([&](std::span<double> part) { all.insert(all.end(), part.begin(), part.end()); });
+  if (solver_) solver_->forget();
+  return all;
+}
+
+template <int dim>
+void Fluid<dim>::restore(std::span<const double> state) {
+  std::size_t size = 1;
+  each_part([&](std::span<double> part) { size += part.size(); });
+  if (state.empty() || state[0] != fingerprint(space_) || state.size() != size)
+    throw std::invalid_argument(fmt::format("restore: the state is of another mesh or element ({} numbers where this one has {}); make the fluid on the mesh it was saved with", state.size(), size));
+  std::size_t at = 1;
+  each_part([&](std::span<double> part) {
+    std::copy_n(state.begin() + at, part.size(), part.begin());
+    at += part.size();
+  });
+  old_position_ = position_;
+  if (solver_) solver_->forget();
+}
+
 template <int dim>
 void Fluid<dim>::throw_newton(const char* function, const Report& report) const {
   throw NotConverged(fmt::format("{}: Newton's iteration for the advection in step {}, t = {:.6g} s, still changes by {:.1e} after {} iterations. Likely causes: a flow that has no "
@@ -993,7 +1044,7 @@ std::vector<Vec<dim>> Fluid<dim>::harmonic(const std::vector<std::vector<int>>& 
     for (auto& held : is_held) held.assign(space_.nodes(), false);
     for (std::size_t f = 0; f < mesh_->facets.size(); ++f) {
       if (mesh_->facet_elements[f][1] >= 0) continue;
-      const Vec<dim> normal = FacetView<dim>(*mesh_, position_, static_cast<int>(f)).area.normalized();
+      const Vec<dim> normal = FacetView<dim>(*mesh_, mesh_->nodes, static_cast<int>(f)).area.normalized();
       for (const int k : mesh_->facets[f])
         for (int axis = 0; axis < dim; ++axis) is_held[axis][space_.vertex[k]] |= motion_[mesh_->boundary[f]] || std::abs(normal[axis]) > 1e-6;
     }
@@ -1006,7 +1057,7 @@ std::vector<Vec<dim>> Fluid<dim>::harmonic(const std::vector<std::vector<int>>& 
       std::vector<Eigen::Triplet<double>> inner, outer;
       for (const auto& element : mesh_->elements) {
         std::array<Vec<dim>, dim + 1> corner;
-        for (int a = 0; a <= dim; ++a) corner[a] = position_[element[a]];
+        for (int a = 0; a <= dim; ++a) corner[a] = mesh_->nodes[element[a]];
         const Geometry<dim> g = geometry<dim>(corner);
         for (int a = 0; a <= dim; ++a)
           for (int b = 0; b <= dim; ++b) {

@@ -85,6 +85,12 @@ class Fluid {
   Report step(double dt);
   Report solve_steady();
 
+  // All that changes from step to step; conditions, fields and settings do not belong to it. The step after state() factorises anew, so that
+  // a run that goes on and one that is restored there, on as many ranks, stay the same bit for bit. restore() throws std::invalid_argument
+  // where the state is of another mesh or element.
+  std::vector<double> state();
+  void restore(std::span<const double> state);
+
   double time() const { return time_; }
   const Mesh<dim>& mesh() const { return *mesh_; }
   const Space<dim>& space() const { return space_; }
@@ -130,6 +136,8 @@ class Fluid {
   Condition& condition(const char* function, const std::string& name, Kind kind);
   void check_conditions(const char* function) const;
   bool has_pressure_reference() const;
+  template <class Visit>
+  void each_part(Visit&& visit);
   void move_mesh(double t, double dt);
   std::vector<Vec<dim>> harmonic(const std::vector<std::vector<int>>& moved, const std::vector<std::vector<Vec<dim>>>& velocity);
   std::vector<Vec<dim>> stretch(const std::vector<std::vector<int>>& moved, const std::vector<std::vector<Vec<dim>>>& velocity) const;

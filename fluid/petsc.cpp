@@ -153,6 +153,8 @@ LinearSolver::LinearSolver(int begin, int end, int size, const std::vector<int>&
 
 LinearSolver::~LinearSolver() = default;
 
+void LinearSolver::forget() { s_->keep_factors = false, s_->scale = 0.0; }
+
 LinearReport LinearSolver::solve(std::span<const double> values, std::span<const double> b, std::span<double> x) {
   LinearReport report;
   if (const int bs = s_->block; bs > 1) {

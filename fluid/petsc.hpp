@@ -50,6 +50,7 @@ class LinearSolver {
   ~LinearSolver();
   // x of this rank's rows from 0; `values` along row_start and column. Numbers that differ between ranks: the same report on all.
   LinearReport solve(std::span<const double> values, std::span<const double> b, std::span<double> x);
+  void forget();  // factors and scales of earlier systems
 
  private:
   struct State;

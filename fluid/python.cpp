@@ -8,6 +8,8 @@
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
+#include <map>
+
 namespace py = pybind11;
 using namespace py::literals;
 
@@ -126,6 +128,47 @@ struct FluidInPython : Fluid<dim> {
   }
 };
 
+// The mesh as it is, with its fields; with order 2 in the order of nodes of XDMF's quadratic cells, images of edges across a period apart.
+template <int dim>
+py::dict frame(const FluidInPython<dim>& f) {
+  const auto& space = f.space();
+  auto x = f.nodes(), u = f.velocity();
+  auto p = f.pressure(), eps = f.void_fraction();
+  std::vector<int> index(space.nodes(), -1);  // of the middles of edges among nodes()
+  for (int node = 0; node < space.nodes(); ++node)
+    if (!space.is_vertex(node)) {
+      index[node] = static_cast<int>(p.size());
+      p.push_back(0.5 * (p[space.between[node][0]] + p[space.between[node][1]]));
+    }
+  std::map<std::array<int, 2>, int> images;  // by the ends of the edge
+  const auto& elements = f.mesh().elements;
+  py::array_t<int> connectivity({static_cast<int>(elements.size()), space.per_element});
+  auto to = connectivity.mutable_unchecked<2>();
+  for (std::size_t e = 0; e < elements.size(); ++e) {
+    for (int a = 0; a <= dim; ++a) to(e, a) = elements[e][a];
+    for (int k = 0; dim + 1 + k < space.per_element; ++k) {
+      // XDMF goes round the triangle, and from it to the fourth corner.
+      constexpr std::array<int, 6> place = dim == 2 ? std::array{0, 2, 1, 0, 0, 0} : std::array{0, 2, 3, 1, 4, 5};
+      const int a = elements[e][simplex_edges<dim>[k][0]], b = elements[e][simplex_edges<dim>[k][1]];
+      int at = index[space.node_of[e * space.per_element + dim + 1 + k]];
+      const Vec<dim> middle = 0.5 * (x[a] + x[b]);
+      if ((middle - x[at]).norm() > 1e-6 * (x[a] - x[b]).norm()) {
+        const auto [image, is_new] = images.try_emplace({std::min(a, b), std::max(a, b)}, static_cast<int>(x.size()));
+        if (is_new) x.push_back(middle), u.push_back(u[at]), p.push_back(p[at]), eps.push_back(eps[at]);
+        at = image->second;
+      }
+      to(e, dim + 1 + place[k]) = at;
+    }
+  }
+  auto three = [](const std::vector<Vec<dim>>& v) {
+    Array rows({v.size(), std::size_t(3)});
+    for (std::size_t k = 0; k < v.size(); ++k)
+      for (int i = 0; i < 3; ++i) rows.mutable_at(k, i) = i < dim ? v[k][i] : 0.0;
+    return rows;
+  };
+  return py::dict("fluid"_a = py::dict("position"_a = three(x), "connectivity"_a = connectivity, "velocity"_a = three(u), "pressure"_a = copied(p), "void_fraction"_a = copied(eps)));
+}
+
 template <int dim>
 void add_fluid(py::module_& m, const char* name) {
   using F = FluidInPython<dim>;
@@ -184,6 +227,12 @@ void add_fluid(py::module_& m, const char* name) {
       .def("solve_steady", [](F& f) { f.evaluate(f.time()); return f.solve_steady(); }, "The steady flow, from the present one. Raises NotConverged.")
       .def("set_velocity", [](F& f, const py::object& u) { f.set_velocity(vectors<dim>(u, f.nodes().size(), "set_velocity: velocity")); }, "velocity"_a, "At `nodes`, (n, dim) or one for all [m/s].")
       .def("set_pressure", [](F& f, const py::object& p) { f.set_pressure(scalars(p, f.mesh().nodes.size(), "set_pressure: pressure")); }, "pressure"_a, "At the nodes of the mesh [Pa].")
+      .def("state", [](F& f) { return copied(f.state()); },
+           "All that changes from step to step (n,), for `restore`; conditions, fields and settings do not belong to it. The next step factorises anew, so that a run that goes on and one\n"
+           "that is restored, on as many processes, stay the same bit for bit.")
+      .def("restore", [](F& f, const Array& state) { f.restore({state.data(), static_cast<std::size_t>(state.size())}); }, "state"_a,
+           "As it was when `state` was taken. Raises ValueError where the mesh or the element is another.")
+      .def("frame", &frame<dim>, "For `Frames.write`: {\"fluid\": position, connectivity, velocity, pressure, void_fraction}.")
       .def_property_readonly("nodes", [](const F& f) { const auto x = f.nodes(); return copied<dim>(std::span<const Vec<dim>>(x)); }, "(n, dim) [m]: the nodes of the mesh, with p2p1 then the middles of edges.")
       .def_property_readonly("velocity", [](const F& f) { const auto u = f.velocity(); return copied<dim>(std::span<const Vec<dim>>(u)); }, "of the fluid at `nodes` (n, dim) [m/s]")
       .def_property_readonly("pressure", [](const F& f) { return copied(f.pressure()); }, "at the nodes of the mesh (n,) [Pa]")

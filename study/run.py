@@ -161,7 +161,7 @@ class _Files:
 
     def after_step(self, run):
         if self.frames and run.samples % self.frame_steps == 0:
-            self.frames.write(run.sim, {name: run[name][self.written:] for name in run.names})
+            self.frames.write(run.sim, series={name: run[name][self.written:] for name in run.names})
             self.written = run.samples
         if 0 < self.checkpoint_every <= time.monotonic() - self.last:
             self._checkpoint(run)

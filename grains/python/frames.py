@@ -57,7 +57,7 @@ class Frames:
     """Writes the frames of a run into a folder.
 
     run.h5 leads to all: attributes `version`, `parameters` (JSON); `frames/000000` ... link to frames/000000.h5 ... (docs/output.md
-    lists what a frame holds). grains.xdmf and contacts.xdmf show them in ParaView.
+    lists what a frame holds). An XDMF file for each group of a frame shows it in ParaView: grains.xdmf, contacts.xdmf, fluid.xdmf.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class Frames:
 
         self.folder, self.parameters, self.count = Path(folder), parameters, count
         self.numbers = []  # of the frames in the folder
-        self.grids = {"grains": [], "contacts": []}  # XDMF of each frame
+        self.grids = {}  # XDMF of each frame, by group
         (self.folder / "frames").mkdir(parents=True, exist_ok=True)
         for path in sorted((self.folder / "frames").glob("*.h5")):
             if path.stem.isdigit() and int(path.stem) < count:
@@ -84,19 +84,23 @@ class Frames:
                 path.unlink()
         self._write_index()
 
-    def write(self, sim, series=None):
+    def write(self, *parts, series=None):
         """Add a frame of the scene as it is now.
 
         Parameters
         ----------
-        sim : Simulation
+        parts : Simulation, or whatever has `time` [s] and `frame()` -> {group: {name: array}}
+            The first one's time is that of the frame. A group is a set of points with `position` (n, 3), or cells with `connectivity`
+            (m, 2 to 10), and arrays for each point or cell.
         series : dict of (n,) arrays, optional
             Time series since the last frame.
         """
-        groups = {"grains": _grains(sim), "contacts": _contacts(sim)}
+        groups, time = {}, parts[0].time
+        for part in parts:
+            groups |= part.frame() if hasattr(part, "frame") else {"grains": _grains(part), "contacts": _contacts(part)}
 
         def fill(file):
-            file.attrs["time"] = sim.time
+            file.attrs["time"] = time
             for group, arrays in groups.items():
                 for name, values in arrays.items():
                     file[f"{group}/{name}"] = values
@@ -106,13 +110,14 @@ class Frames:
         path = self.folder / "frames" / f"{self.count:06d}.h5"
         write_whole(path, hdf5_bytes(fill))
         self.count += 1
-        self._take(path, sim.time, groups)
+        self._take(path, time, groups)
         self._write_index()
 
     def _take(self, path, time, frame):
         self.numbers.append(path.stem)
-        for name, grids in self.grids.items():
-            grids.append(_grid(frame[name], f"frames/{path.name}:/{name}", time))
+        for name in frame:
+            if name != "series":
+                self.grids.setdefault(name, []).append(_grid(frame[name], f"frames/{path.name}:/{name}", time))
 
     def _write_index(self):
         import h5py
@@ -177,20 +182,26 @@ def contact_lines(sim):
     return np.stack([start, start + branch], axis=1), contacts
 
 
+CELLS = {2: 'TopologyType="Polyline" NodesPerElement="2"', 3: 'TopologyType="Triangle"', 4: 'TopologyType="Tetrahedron"', 6: 'TopologyType="Triangle_6"',
+         10: 'TopologyType="Tetrahedron_10"'}  # by nodes of each
+
+
 def _grid(arrays, place, time):
-    """XDMF of one frame: points, or lines where there is a connectivity, and every array that has one value or vector for each."""
-    if not len(arrays["position"]):
+    """XDMF of one frame: points, or cells where there is a connectivity, and every array that has one value or vector for each."""
+    points = len(arrays["position"])
+    if not points:
         return ""  # readers stumble over empty grids
     if "connectivity" in arrays:
-        center, topology = "Cell", f'TopologyType="Polyline" NodesPerElement="2" NumberOfElements="{len(arrays["connectivity"])}"'
-        cells = _item(arrays, place, "connectivity")
+        number, nodes = arrays["connectivity"].shape
+        topology, cells = f'{CELLS[nodes]} NumberOfElements="{number}"', _item(arrays, place, "connectivity")
     else:
-        center, topology, cells = "Node", f'TopologyType="Polyvertex" NumberOfElements="{len(arrays["position"])}"', ""
+        topology, cells = f'TopologyType="Polyvertex" NumberOfElements="{points}"', ""
     text = [f'<Grid Name="{place}" GridType="Uniform"><Time Value="{time:.12g}"/>\n<Topology {topology}>{cells}</Topology>\n',
             f'<Geometry GeometryType="XYZ">{_item(arrays, place, "position")}</Geometry>\n']
     for name in arrays:
         if name not in ("position", "connectivity"):
             rank = "Vector" if arrays[name].ndim == 2 else "Scalar"
+            center = "Node" if len(arrays[name]) == points else "Cell"
             text.append(f'<Attribute Name="{name}" AttributeType="{rank}" Center="{center}">{_item(arrays, place, name)}</Attribute>\n')
     return "".join(text) + "</Grid>\n"
 
