@@ -2,6 +2,8 @@
 
 #include "locator.hpp"
 
+#include <Eigen/Sparse>
+
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
@@ -26,12 +28,14 @@ struct FacetView {
   int element;
   std::array<int, dim> corner;
   Vec<dim> area;  // [m^(dim-1)]
-  FacetView(const Mesh<dim>& mesh, const std::vector<Vec<dim>>& position, int facet) : element(mesh.facet_elements[facet][0]) {
+  FacetView(const Mesh<dim>& mesh, const std::vector<Vec<dim>>& position, int facet) : FacetView(mesh, facet, [&](int node) { return position[node]; }) {}
+  template <class Place>
+  FacetView(const Mesh<dim>& mesh, int facet, Place&& place) : element(mesh.facet_elements[facet][0]) {
     std::array<Vec<dim>, dim + 1> x;
     int opposite = 0, k = 0;
     for (int a = 0; a <= dim; ++a) {
       const int node = mesh.elements[element][a];
-      x[a] = position[node];
+      x[a] = place(node);
       const auto& in = mesh.facets[facet];
       std::find(in.begin(), in.end(), node) == in.end() ? void(opposite = a) : void(corner[k++] = a);
     }
@@ -71,6 +75,10 @@ Fluid<dim>::Fluid(std::shared_ptr<const Mesh<dim>> mesh, int order, Properties<d
   has_frame_.assign(space_.nodes(), false);
   facets_of_.resize(conditions_.size());
   for (std::size_t f = 0; f < mesh_->facets.size(); ++f) facets_of_[mesh_->boundary[f]].push_back(static_cast<int>(f));
+  motion_.resize(conditions_.size());
+  swept_.assign(conditions_.size(), 0.0);
+  old_swept_ = old_swept_used_ = swept_;
+  pore_volume_.fill(pore_volume(eps_[0]));
   outer_pressure_.resize(conditions_.size());
   outer_velocity_.resize(conditions_.size());
 }
@@ -123,6 +131,15 @@ void Fluid<dim>::set_permeable(const std::string& boundary, VectorField<dim> vel
 }
 
 template <int dim>
+void Fluid<dim>::move_boundary(const std::string& boundary, VectorField<dim> velocity) {
+  const int k = boundary_index("move_boundary", boundary);
+  for (const int f : facets_of_[k])
+    if (mesh_->facet_elements[f][1] >= 0) throw std::invalid_argument(fmt::format("move_boundary: \"{}\" has facets inside the domain or on a periodic side", boundary));
+  motion_[k] = std::move(velocity);
+  harmonic_.reset();
+}
+
+template <int dim>
 bool Fluid<dim>::has_pressure_reference() const {
   return std::any_of(conditions_.begin(), conditions_.end(), [](const Condition& c) { return c.kind == Kind::outflow || c.kind == Kind::permeable; });
 }
@@ -166,7 +183,7 @@ void Fluid<dim>::set_void_fraction(std::span<const double> eps) {
     const auto [a, b] = space_.between[node];
     eps_[0][node] = eps.size() == all ? eps[k++] : 0.5 * (eps_[0][space_.vertex[a]] + eps_[0][space_.vertex[b]]);
   }
-  if (!eps_started_) eps_[2] = eps_[1] = eps_[0];  // the first to be set is that of the start as well
+  if (!eps_started_) eps_[2] = eps_[1] = eps_[0], pore_volume_.fill(pore_volume(eps_[0]));  // the first to be set is that of the start as well
   eps_started_ = true;
 }
 
@@ -283,8 +300,9 @@ void Fluid<dim>::hold(double t) {
         same == known.end() ? known.push_back(facet.area) : void(*same += facet.area);
       }
     }
-    std::vector<Vec<dim>> value(x.size(), Vec<dim>::Zero());
+    std::vector<Vec<dim>> value;
     if (c.velocity) value = c.velocity(x, t);
+    else for (const int node : of_boundary) value.push_back(mesh_velocity_at(node));
     for (std::size_t m = 0; m < x.size(); ++m) {
       if (!value[m].allFinite())
         throw std::invalid_argument(fmt::format("step: the velocity on \"{}\" must be finite, got {} m/s at {}", mesh_->boundary_names[k], at<dim>(value[m]), at<dim>(x[m])));
@@ -318,8 +336,7 @@ void Fluid<dim>::hold(double t) {
       held.frame.setIdentity();
       continue;
     }
-    Vec<dim> with_mesh = mesh_velocity_[space_.between[node][0]];
-    with_mesh = 0.5 * (with_mesh + mesh_velocity_[space_.between[node][1]]);
+    const Vec<dim> with_mesh = mesh_velocity_at(node);
     for (const Held1& say : says[node])
       for (const Vec<dim>& normal : say.normals) {
         if (say.kind == Kind::slip) {
@@ -345,6 +362,11 @@ void Fluid<dim>::hold(double t) {
 }
 
 template <int dim>
+Vec<dim> Fluid<dim>::mesh_velocity_at(int node) const {
+  return 0.5 * (mesh_velocity_[space_.between[node][0]] + mesh_velocity_[space_.between[node][1]]);
+}
+
+template <int dim>
 std::vector<std::pair<int, Vec<dim>>> Fluid<dim>::facet_nodes(int facet) const {
   std::vector<std::pair<int, Vec<dim>>> nodes;
   for (const int k : mesh_->facets[facet]) nodes.emplace_back(space_.vertex[k], position_[k]);
@@ -367,16 +389,19 @@ void Fluid<dim>::evaluate_outside(double t) {
   for (std::size_t k = 0; k < conditions_.size(); ++k) {
     const Condition& c = conditions_[k];
     if (!c.pressure) continue;
-    std::vector<Vec<dim>> x;
+    std::vector<Vec<dim>> x, with_mesh;
     for (const int f : facets_of_[k]) {
       const FacetView<dim> facet(*mesh_, position_, f);
       along<dim>(facet, [&](const Barycentric<dim>& l, double) {
-        x.push_back(Vec<dim>::Zero());
-        for (int a = 0; a <= dim; ++a) x.back() += l[a] * position_[mesh_->elements[facet.element][a]];
+        x.push_back(Vec<dim>::Zero()), with_mesh.push_back(Vec<dim>::Zero());
+        for (int a = 0; a <= dim; ++a) {
+          const int corner = mesh_->elements[facet.element][a];
+          x.back() += l[a] * position_[corner], with_mesh.back() += l[a] * mesh_velocity_[corner];
+        }
       });
     }
     outer_pressure_[k] = c.pressure(x, t);
-    outer_velocity_[k] = c.velocity ? c.velocity(x, t) : std::vector<Vec<dim>>(x.size(), Vec<dim>::Zero());
+    outer_velocity_[k] = c.velocity ? c.velocity(x, t) : with_mesh;
     for (std::size_t m = 0; m < x.size(); ++m)
       if (!std::isfinite(outer_pressure_[k][m]) || !outer_velocity_[k][m].allFinite())
         throw std::invalid_argument(fmt::format("step: pressure and velocity on \"{}\" must be finite, got {} Pa and {} m/s at {}", mesh_->boundary_names[k],
@@ -703,11 +728,34 @@ Report Fluid<dim>::step(double dt) {
   const bool second = settings.scheme == Scheme::bdf2 && steps_ > 0;
   const double r = second ? dt / dt_ : 0.0;
   const TimeWeights time = second ? TimeWeights{(1 + 2 * r) / (1 + r) / dt, -(1 + r) / dt, r * r / (1 + r) / dt} : TimeWeights{1 / dt, -1 / dt, 0.0};
-  const double t = time_ + dt;
-  eps_change_ = eps_change(dt);
+  for (int k = 0; k < space_.dofs(); ++k) guess_[k] = x_[0][k] + (second ? r * (x_[0][k] - x_[1][k]) : 0.0);
+  const std::vector<Vec<dim>> mesh_velocity = mesh_velocity_;
+  old_position_ = position_;
+  std::vector<double> x;
+  try {
+    move_mesh(time_ + dt, dt);
+    pore_volume_[0] = pore_volume(eps_[0]);
+    for (std::size_t k = 0; k < swept_.size(); ++k) swept_[k] = swept(static_cast<int>(k), dt);
+    eps_change_ = eps_change(dt);
+    x = solve_step(time_ + dt, time, report);
+    account(report, x, time);
+  } catch (...) {
+    position_ = old_position_, mesh_velocity_ = mesh_velocity;
+    throw;
+  }
+  x_[1].swap(x_[0]), x_[0].swap(x);
+  eps_[2] = eps_[1], eps_[1] = eps_[0];
+  pore_volume_[2] = pore_volume_[1], pore_volume_[1] = pore_volume_[0];
+  old_eps_change_ = eps_change_, old_swept_used_ = old_swept_, old_swept_ = swept_;
+  time_weights_ = time, time_ += dt, dt_ = dt;
+  ++steps_;
+  return report;
+}
+
+template <int dim>
+std::vector<double> Fluid<dim>::solve_step(double t, const TimeWeights& time, Report& report) {
   hold(t);
   evaluate_outside(t);
-  for (int k = 0; k < space_.dofs(); ++k) guess_[k] = x_[0][k] + (second ? r * (x_[0][k] - x_[1][k]) : 0.0);
   std::vector<double> x = guess_;
   const bool newton = settings.advection == Advection::newton;
   for (int k = 0;; ++k) {
@@ -715,18 +763,10 @@ Report Fluid<dim>::step(double dt) {
     ++report.newton_iterations;
     report.change = relative_change(next, x);
     x.swap(next);
-    if (!newton || report.change < settings.newton_tolerance) break;
+    if (!newton || report.change < settings.newton_tolerance) return x;
     if (k == settings.max_newton) throw_newton("step", report);
     guess_ = x;
   }
-  account(report, x, time);
-  x_[1].swap(x_[0]), x_[0].swap(x);
-  eps_[2] = eps_[1], eps_[1] = eps_[0];
-  old_eps_change_ = eps_change_;
-  old_position_ = position_;
-  time_ = t, dt_ = dt;
-  ++steps_;
-  return report;
 }
 
 template <int dim>
@@ -742,8 +782,10 @@ Report Fluid<dim>::solve_steady() {
   check_conditions("solve_steady");
   Report report;
   const TimeWeights time{};
-  std::fill(eps_change_.begin(), eps_change_.end(), 0.0);
+  for (auto* none : {&eps_change_, &swept_, &old_swept_}) std::fill(none->begin(), none->end(), 0.0);
+  std::fill(mesh_velocity_.begin(), mesh_velocity_.end(), Vec<dim>::Zero());
   eps_[2] = eps_[1] = eps_[0];
+  pore_volume_.fill(pore_volume(eps_[0]));
   hold(time_);
   evaluate_outside(time_);
   std::vector<double> x = x_[0];
@@ -759,6 +801,7 @@ Report Fluid<dim>::solve_steady() {
   }
   account(report, x, time);
   x_[1] = x_[0] = x;
+  time_weights_ = time;
   steps_ = 0;
   return report;
 }
@@ -782,7 +825,8 @@ double Fluid<dim>::flux_of(const std::vector<double>& x, int boundary) const {
 
 template <int dim>
 double Fluid<dim>::flux(const std::string& boundary) const {
-  return flux_of(x_[0], boundary_index("flux", boundary));
+  const int k = boundary_index("flux", boundary);
+  return flux_of(x_[0], k) - (time_weights_[0] * old_swept_[k] - time_weights_[2] * old_swept_used_[k]);
 }
 
 template <int dim>
@@ -790,15 +834,14 @@ void Fluid<dim>::account(Report& report, const std::vector<double>& x, const Tim
   double area = 0.0, fastest = 0.0, pores = 0.0;
   for (std::size_t k = 0; k < conditions_.size(); ++k) {
     if (conditions_[k].kind == Kind::none) continue;  // inside, or on a periodic side
-    report.net_inflow -= flux_of(x, static_cast<int>(k));
+    report.net_inflow -= flux_of(x, static_cast<int>(k)) - (time[0] * swept_[k] - time[2] * old_swept_[k]);
     for (const int f : facets_of_[k]) area += FacetView<dim>(*mesh_, position_, f).area.norm();
   }
   for (int node = 0; node < space_.nodes(); ++node) {
     fastest = std::max(fastest, Eigen::Map<const Vec<dim>>(&x[space_.first_dof[node]]).norm());
-    if (!space_.is_vertex(node)) continue;
-    const double rate = time[0] * eps_change_[node] - time[2] * old_eps_change_[node];
-    report.pore_volume_rate += rate, pores += std::abs(rate);
+    if (space_.is_vertex(node)) pores += std::abs(time[0] * eps_change_[node] - time[2] * old_eps_change_[node]);
   }
+  report.pore_volume_rate = time[0] * pore_volume_[0] + time[1] * pore_volume_[1] + time[2] * pore_volume_[2];
   const double size = fastest * area + pores;
   report.volume_error = size > 0 ? std::abs(report.pore_volume_rate - report.net_inflow) / size : 0.0;
 }
@@ -886,6 +929,164 @@ auto Fluid<dim>::probe(std::span<const Vec<dim>> x) const -> std::vector<Probe> 
     found.push_back(probe);
   }
   return found;
+}
+
+template <int dim>
+double Fluid<dim>::pore_volume(const std::vector<double>& eps) const {
+  double sum = 0.0;
+  auto add = [&]<int order>(std::integral_constant<int, order>) {
+    for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
+      std::array<Vec<dim>, dim + 1> corner;
+      for (int a = 0; a <= dim; ++a) corner[a] = position_[mesh_->elements[e][a]];
+      double mean = 0.0;
+      for (const auto& point : quadrature<dim, order>()) {
+        const auto shape = shapes<dim, order>(point.l);
+        for (int a = 0; a < shape_count<dim, order>; ++a) mean += point.weight * shape[a] * eps[space_.node_of[e * space_.per_element + a]];
+      }
+      sum += geometry<dim>(corner).volume * mean;
+    }
+  };
+  velocity_order() == 1 ? add(std::integral_constant<int, 1>{}) : add(std::integral_constant<int, 2>{});
+  return sum;
+}
+
+// int int eps w . n dA dt over a step, with eps of its end carried along: exact, as in eps_change().
+template <int dim>
+double Fluid<dim>::swept(int boundary, double dt) const {
+  double sum = 0.0;
+  auto add = [&]<int order>(std::integral_constant<int, order>) {
+    for (const double side : {-1.0, 1.0}) {
+      const double share = 0.5 + side * 0.5 / std::sqrt(3.0);
+      for (const int f : facets_of_[boundary]) {
+        const FacetView<dim> facet(*mesh_, f, [&](int k) { return Vec<dim>((1 - share) * old_position_[k] + share * position_[k]); });
+        along<dim>(facet, [&](const Barycentric<dim>& l, double weight) {
+          const auto shape = shapes<dim, order>(l);
+          double eps = 0.0;
+          Vec<dim> w = Vec<dim>::Zero();
+          for (int a = 0; a < shape_count<dim, order>; ++a) eps += shape[a] * eps_[0][space_.node_of[facet.element * space_.per_element + a]];
+          for (int a = 0; a <= dim; ++a) w += l[a] * mesh_velocity_[mesh_->elements[facet.element][a]];
+          sum += 0.5 * dt * weight * eps * w.dot(facet.area);
+        });
+      }
+    }
+  };
+  velocity_order() == 1 ? add(std::integral_constant<int, 1>{}) : add(std::integral_constant<int, 2>{});
+  return sum;
+}
+
+// Factors of the mesh's Laplacian, for each component with its own held nodes.
+template <int dim>
+struct Fluid<dim>::Harmonic {
+  std::array<std::vector<int>, dim> row;  // of each velocity node among the free ones, or -1
+  std::array<Eigen::SparseMatrix<double>, dim> held;  // what held nodes do to free rows
+  std::array<Eigen::SimplicialLDLT<Eigen::SparseMatrix<double>>, dim> factors;
+};
+
+template <int dim>
+std::vector<Vec<dim>> Fluid<dim>::harmonic(const std::vector<std::vector<int>>& moved, const std::vector<std::vector<Vec<dim>>>& velocity) {
+  std::vector<Vec<dim>> at_node(space_.nodes(), Vec<dim>::Zero());
+  for (std::size_t k = 0; k < moved.size(); ++k)
+    for (std::size_t m = 0; m < moved[k].size(); ++m) at_node[space_.vertex[moved[k][m]]] = velocity[k][m];
+  if (!harmonic_) {
+    harmonic_ = std::make_unique<Harmonic>();
+    std::array<std::vector<char>, dim> is_held;
+    for (auto& held : is_held) held.assign(space_.nodes(), false);
+    for (std::size_t f = 0; f < mesh_->facets.size(); ++f) {
+      if (mesh_->facet_elements[f][1] >= 0) continue;
+      const Vec<dim> normal = FacetView<dim>(*mesh_, position_, static_cast<int>(f)).area.normalized();
+      for (const int k : mesh_->facets[f])
+        for (int axis = 0; axis < dim; ++axis) is_held[axis][space_.vertex[k]] |= motion_[mesh_->boundary[f]] || std::abs(normal[axis]) > 1e-6;
+    }
+    for (int axis = 0; axis < dim; ++axis) {
+      auto& row = harmonic_->row[axis];
+      row.assign(space_.nodes(), -1);
+      int free = 0;
+      for (int node = 0; node < space_.nodes(); ++node)
+        if (space_.is_vertex(node) && !is_held[axis][node]) row[node] = free++;
+      std::vector<Eigen::Triplet<double>> inner, outer;
+      for (const auto& element : mesh_->elements) {
+        std::array<Vec<dim>, dim + 1> corner;
+        for (int a = 0; a <= dim; ++a) corner[a] = position_[element[a]];
+        const Geometry<dim> g = geometry<dim>(corner);
+        for (int a = 0; a <= dim; ++a)
+          for (int b = 0; b <= dim; ++b) {
+            const int i = space_.vertex[element[a]], j = space_.vertex[element[b]];
+            if (row[i] < 0) continue;
+            const double value = g.volume * g.grad_l[a].dot(g.grad_l[b]);
+            row[j] < 0 ? outer.emplace_back(row[i], j, value) : inner.emplace_back(row[i], row[j], value);
+          }
+      }
+      Eigen::SparseMatrix<double> laplacian(free, free);
+      laplacian.setFromTriplets(inner.begin(), inner.end());
+      harmonic_->held[axis].resize(free, space_.nodes());
+      harmonic_->held[axis].setFromTriplets(outer.begin(), outer.end());
+      if (free > 0) harmonic_->factors[axis].compute(laplacian);
+      if (free > 0 && harmonic_->factors[axis].info() != Eigen::Success)
+        throw std::invalid_argument(fmt::format("step: nothing holds the nodes of the mesh along axis {}; move a boundary with move_boundary", axis));
+    }
+  }
+  for (int axis = 0; axis < dim; ++axis) {
+    if (harmonic_->held[axis].rows() == 0) continue;
+    Eigen::VectorXd known(space_.nodes());
+    for (int node = 0; node < space_.nodes(); ++node) known[node] = at_node[node][axis];
+    const Eigen::VectorXd found = harmonic_->factors[axis].solve(-(harmonic_->held[axis] * known));
+    for (int node = 0; node < space_.nodes(); ++node)
+      if (harmonic_->row[axis][node] >= 0) at_node[node][axis] = found[harmonic_->row[axis][node]];
+  }
+  std::vector<Vec<dim>> w;
+  for (const int node : space_.vertex) w.push_back(at_node[node]);
+  return w;
+}
+
+template <int dim>
+std::vector<Vec<dim>> Fluid<dim>::stretch(const std::vector<std::vector<int>>& moved, const std::vector<std::vector<Vec<dim>>>& velocity) const {
+  std::vector<Vec<dim>> place, w;
+  for (std::size_t k = 0; k < moved.size(); ++k) {
+    if (moved[k].empty()) continue;
+    place.push_back(Vec<dim>::Zero()), w.push_back(velocity[k][0]);
+    for (std::size_t m = 0; m < moved[k].size(); ++m) {
+      place.back() += position_[moved[k][m]] / moved[k].size();
+      if ((velocity[k][m] - w.back()).norm() > 1e-12 * w.back().norm())
+        throw std::invalid_argument(fmt::format("step: mesh_motion \"stretch\" needs boundaries that move as a whole, but \"{}\" does not; use \"harmonic\"", mesh_->boundary_names[k]));
+    }
+  }
+  if (place.size() != 2) throw std::invalid_argument(fmt::format("step: mesh_motion \"stretch\" is between two boundaries that move, got {}; move the other one with velocity 0, or use \"harmonic\"", place.size()));
+  // The axis that tells them apart: their centres may be shifted along the others.
+  int axis;
+  (place[1] - place[0]).cwiseAbs().maxCoeff(&axis);
+  std::vector<Vec<dim>> at_nodes;
+  for (const Vec<dim>& x : position_) {
+    const double share = (x[axis] - place[0][axis]) / (place[1][axis] - place[0][axis]);
+    at_nodes.push_back((1 - share) * w[0] + share * w[1]);
+  }
+  return at_nodes;
+}
+
+// Moves the mesh over a step. Throws, with the mesh where it was, when an element would fold.
+template <int dim>
+void Fluid<dim>::move_mesh(double t, double dt) {
+  if (std::none_of(motion_.begin(), motion_.end(), [](const auto& m) { return static_cast<bool>(m); })) return;
+  std::vector<std::vector<int>> moved(motion_.size());  // mesh nodes of each boundary that moves
+  std::vector<std::vector<Vec<dim>>> velocity(motion_.size());
+  for (std::size_t k = 0; k < motion_.size(); ++k) {
+    if (!motion_[k]) continue;
+    std::vector<char> seen(position_.size(), false);
+    std::vector<Vec<dim>> x;
+    for (const int f : facets_of_[k])
+      for (const int node : mesh_->facets[f])
+        if (!seen[node]) seen[node] = true, moved[k].push_back(node), x.push_back(position_[node]);
+    velocity[k] = motion_[k](x, t);
+    for (std::size_t m = 0; m < x.size(); ++m)
+      if (!velocity[k][m].allFinite()) throw std::invalid_argument(fmt::format("step: the velocity of boundary \"{}\" must be finite, got {} m/s at {}", mesh_->boundary_names[k], at<dim>(velocity[k][m]), at<dim>(x[m])));
+  }
+  mesh_velocity_ = mesh_motion == MeshMotion::harmonic ? harmonic(moved, velocity) : stretch(moved, velocity);
+  for (std::size_t k = 0; k < position_.size(); ++k) position_[k] = old_position_[k] + dt * mesh_velocity_[k];
+  for (const auto& element : mesh_->elements) {
+    std::array<Vec<dim>, dim + 1> corner;
+    for (int a = 0; a <= dim; ++a) corner[a] = position_[element[a]];
+    if (!(geometry<dim>(corner).volume > 0))
+      throw std::invalid_argument(fmt::format("step: moving the boundaries over {:.4g} s folds the mesh at {} m; take smaller steps, or make a new mesh", dt, at<dim>(corner[0])));
+  }
 }
 
 template class Fluid<2>;

@@ -63,6 +63,13 @@ class Fluid {
   void set_outflow(const std::string& boundary, ScalarField<dim> pressure);
   // Lets fluid through: tangential velocity of the plate, traction -p n along the normal; entering fluid has the plate's velocity.
   void set_permeable(const std::string& boundary, VectorField<dim> velocity, ScalarField<dim> pressure);
+  // Moves a boundary, from the next step on; walls and plates without a velocity of their own go with it. The mesh inside follows:
+  enum class MeshMotion {
+    harmonic,  // each component harmonic on the mesh at the start; boundaries that do not move let nodes slide along the axes they are normal to none of
+    stretch,   // linear between two boundaries that move as a whole, along the line that joins them
+  };
+  void move_boundary(const std::string& boundary, VectorField<dim> velocity);
+  MeshMotion mesh_motion = MeshMotion::harmonic;
   // Where no boundary knows the pressure its mean is 0, or this [Pa].
   void set_mean_pressure(double pressure);
 
@@ -90,7 +97,7 @@ class Fluid {
 
   // Of the fluid on a boundary [N] (2D: N/m): pressure, and the viscous traction as the momentum balance has it.
   Vec<dim> force(const std::string& boundary) const;
-  // int U . n along a named boundary, or named facets inside [m^dim/s]; relative to the mesh when that moves.
+  // int (U - eps w) . n over the last step along a named boundary, or named facets inside [m^dim/s]: relative to the mesh.
   double flux(const std::string& boundary) const;
   struct Probe {
     Vec<dim> velocity;
@@ -109,9 +116,10 @@ class Fluid {
   struct Condition {
     Kind kind = Kind::none;
     int turn = 0;  // of setting
-    VectorField<dim> velocity;
+    VectorField<dim> velocity;  // none: that of the mesh
     ScalarField<dim> pressure;
   };
+  struct Harmonic;
   struct Held {  // of a velocity node
     Mat<dim> frame = Mat<dim>::Identity();  // its axes as columns
     int first = 0, last = 0;                // held axes: first ... last - 1
@@ -122,6 +130,12 @@ class Fluid {
   Condition& condition(const char* function, const std::string& name, Kind kind);
   void check_conditions(const char* function) const;
   bool has_pressure_reference() const;
+  void move_mesh(double t, double dt);
+  std::vector<Vec<dim>> harmonic(const std::vector<std::vector<int>>& moved, const std::vector<std::vector<Vec<dim>>>& velocity);
+  std::vector<Vec<dim>> stretch(const std::vector<std::vector<int>>& moved, const std::vector<std::vector<Vec<dim>>>& velocity) const;
+  double pore_volume(const std::vector<double>& eps) const;
+  double swept(int boundary, double dt) const;
+  std::vector<double> solve_step(double t, const TimeWeights& time, Report& report);
   void hold(double t);
   void evaluate_outside(double t);
   template <int order>
@@ -136,6 +150,7 @@ class Fluid {
   std::vector<double> times_matrix(const std::vector<double>& x) const;
   std::vector<double> eps_change(double dt) const;
   std::vector<int> node_numbers() const;
+  Vec<dim> mesh_velocity_at(int node) const;
   std::vector<std::pair<int, Vec<dim>>> facet_nodes(int facet) const;
   Vec<dim> velocity_in(int element, const Barycentric<dim>& l) const;
   void spread_surplus(const char* function, const std::vector<double>& x, const TimeWeights& time, std::vector<double>& missing) const;
@@ -148,6 +163,8 @@ class Fluid {
   std::shared_ptr<const Mesh<dim>> mesh_;
   Space<dim> space_;
   std::vector<Condition> conditions_;  // of each boundary
+  std::vector<VectorField<dim>> motion_;  // of each boundary; none: it stays
+  std::unique_ptr<Harmonic> harmonic_;
   int turns_ = 0;
   std::optional<double> mean_pressure_;
   std::vector<Vec<dim>> position_, old_position_;  // of mesh nodes, now and at the start of the step
@@ -155,6 +172,9 @@ class Fluid {
   std::array<std::vector<double>, 3> eps_;         // at velocity nodes: now, one and two steps ago
   std::array<std::vector<double>, 2> x_;           // unknowns, Cartesian, after the last step and the one before
   std::vector<double> guess_;                      // that advects
+  std::array<double, 3> pore_volume_{};            // int eps: now, and one and two steps ago [m^dim]
+  std::vector<double> swept_, old_swept_, old_swept_used_;  // by each boundary over a step: int eps w . n [m^dim]
+  TimeWeights time_weights_{};                     // of the last step
   std::vector<double> eps_change_, old_eps_change_;  // int q (change of eps at a fixed point) of a step, per vertex [m^dim]
   std::vector<Reaction<dim>> reaction_;
   std::vector<Held> held_;

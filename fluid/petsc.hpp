@@ -28,7 +28,7 @@ enum class Method {
 
 struct LinearSettings {
   Method method = Method::direct;
-  double tolerance = 1e-10;     // on the residual, preconditioned, relative to the first one of this system or of recent ones [-]
+  double tolerance = 1e-11;     // on the residual, preconditioned, relative to the first one of this system or of recent ones [-]
   int max_iterations = 1000;
   int most_with_old_factors = 8;  // iterations: more, and the next matrix is factorised anew
 };

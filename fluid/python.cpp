@@ -138,8 +138,8 @@ void add_fluid(py::module_& m, const char* name) {
              return std::make_unique<F>(mesh, one_of<int>("Fluid: element", element, {{"p1p1", 1}, {"p2p1", 2}}), properties);
            }),
            "mesh"_a, py::kw_only(), "density"_a, "viscosity"_a, "element"_a = "p1p1", "gravity"_a = py::none())
-      .def("wall", [](F& f, const std::string& b, const py::object& v) { f.set_wall(b, vector_field<dim>(v.is_none() ? py::cast(std::vector<double>(dim, 0.0)) : v, "wall: velocity")); },
-           "boundary"_a, "velocity"_a = py::none(), "No slip. velocity (dim,) or f(x (n, dim), t) -> (n, dim) [m/s]; none: at rest.")
+      .def("wall", [](F& f, const std::string& b, const py::object& v) { f.set_wall(b, v.is_none() ? VectorField<dim>() : vector_field<dim>(v, "wall: velocity")); },
+           "boundary"_a, "velocity"_a = py::none(), "No slip. velocity (dim,) or f(x (n, dim), t) -> (n, dim) [m/s]; none: that of the boundary, at rest unless `move_boundary` moves it.")
       .def("inflow", [](F& f, const std::string& b, const py::object& v) { f.set_inflow(b, vector_field<dim>(v, "inflow: velocity")); }, "boundary"_a, "velocity"_a,
            "Velocity (dim,) or f(x, t) [m/s]. At the rim a wall holds the fluid instead when it is set later.")
       .def("slip", &F::set_slip, "boundary"_a, "No flow through, no traction along: a smooth wall, or a plane of symmetry.")
@@ -147,10 +147,15 @@ void add_fluid(py::module_& m, const char* name) {
            "Traction -p n, pressure a number or f(x, t) [Pa]. Fluid that comes in brings no momentum.")
       .def("permeable",
            [](F& f, const std::string& b, const py::object& v, const py::object& p) {
-             f.set_permeable(b, vector_field<dim>(v.is_none() ? py::cast(std::vector<double>(dim, 0.0)) : v, "permeable: velocity"), scalar_field<dim>(p, "permeable: pressure"));
+             f.set_permeable(b, v.is_none() ? VectorField<dim>() : vector_field<dim>(v, "permeable: velocity"), scalar_field<dim>(p, "permeable: pressure"));
            },
            "boundary"_a, "velocity"_a = py::none(), "pressure"_a = 0.0,
-           "A plate that lets fluid through: the fluid slides with it (its velocity [m/s]), and crosses it against the pressure behind [Pa].")
+           "A plate that lets fluid through: the fluid slides with it (its velocity [m/s]; none: that of the boundary), and crosses it against the pressure behind [Pa].")
+      .def("move_boundary", [](F& f, const std::string& b, const py::object& v) { f.move_boundary(b, vector_field<dim>(v, "move_boundary: velocity")); }, "boundary"_a, "velocity"_a,
+           "Moves a boundary from the next step on, at (dim,) or f(x, t) [m/s], and the mesh with it: see `mesh_motion`.")
+      .def_property("mesh_motion", [](const F& f) { return f.mesh_motion == F::MeshMotion::harmonic ? "harmonic" : "stretch"; },
+                    [](F& f, const std::string& name) { f.mesh_motion = one_of<typename F::MeshMotion>("mesh_motion", name, {{"harmonic", F::MeshMotion::harmonic}, {"stretch", F::MeshMotion::stretch}}); },
+                    "of the inside: \"harmonic\" (nodes on boundaries that stay slide along axes), or \"stretch\", linear between two boundaries that move as a whole")
       .def("mean_pressure", &F::set_mean_pressure, "pressure"_a = 0.0, "Mean pressure [Pa] where no boundary gives one.")
       .def_property("void_fraction", [](const F& f) { return copied(f.void_fraction()); },
                     [](F& f, const py::object& eps) {
@@ -187,7 +192,7 @@ void add_fluid(py::module_& m, const char* name) {
       .def_property_readonly("dofs", [](const F& f) { return f.space().dofs(); }, "unknowns")
       .def_property_readonly("dim", [](const F&) { return dim; })
       .def("force", &F::force, "boundary"_a, "Of the fluid on a boundary (dim,) [N] (2D: N/m).")
-      .def("flux", &F::flux, "boundary"_a, "int eps u . n over named facets, out of the domain or along their normal [m^3/s] (2D: m^2/s).")
+      .def("flux", &F::flux, "boundary"_a, "int eps (u - w) . n over named facets, out of the domain or along their normal, w the velocity of the mesh; mean of the last step [m^3/s] (2D: m^2/s).")
       .def("probe",
            [](const F& f, const py::object& points) {
              const Array a = numbers(points, "probe: points");
