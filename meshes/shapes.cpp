@@ -23,7 +23,7 @@ void check_length(double length, std::string_view where, std::string_view what) 
   if (!(length > 1e-30 && length < 1e30)) fail("{}: {} must be > 0 m, got {} m", where, what, length);
 }
 
-// How many elements of at most `size` fit along a length; a length that is a multiple but for rounding gives that multiple.
+// Elements along a length so that none is longer than `size`; a length that is a multiple but for rounding gives that multiple.
 int count(double length, double size) { return std::max(1, static_cast<int>(std::ceil(length / size * (1 - 1e-12)))); }
 
 void check_size(double size, double largest, std::string_view where, std::string_view why, double elements) {
@@ -215,7 +215,8 @@ Mesh<2> cylinder_in_channel(double size, const CylinderInChannel& shape) {
   check_length(shape.diameter, where, "diameter");
   if (!(shape.ratio >= 1 && shape.ratio < 1e30)) fail("{}: ratio must be >= 1, got {}", where, shape.ratio);
   const double largest = shape.ratio * size;
-  check_size(size, radius / 2, where, "a quarter of the diameter", 2 * shape.length * shape.height / (largest * largest) + 200 * std::numbers::pi);
+  check_size(size, radius / 2, where, "a quarter of the diameter",
+             2 * shape.length * shape.height / (largest * largest) + 10 * 2 * std::numbers::pi * radius / size);
   const double room = std::min({shape.centre.x(), shape.centre.y(), shape.length - shape.centre.x(), shape.height - shape.centre.y()}) - radius;
   if (!(room >= size))
     fail("{}: between cylinder and walls must be >= {} m, one element, got {:.6g} m (centre {} m, diameter {} m)", where, size, room,

@@ -1,5 +1,6 @@
 """Meshes from .msh files, .geo scripts and models of a gmsh that is alive in the same process."""
 
+import os
 import pathlib
 import subprocess
 import sys
@@ -8,6 +9,7 @@ import textwrap
 import numpy as np
 import pytest
 
+import quicksand
 from quicksand import meshes
 
 SQUARE = """lc = 0.2;
@@ -39,7 +41,9 @@ def read(tmp_path):
 
 def python(code, folder):
     """Runs a script in a process of its own: a gmsh that is alive stays there. Returns what it prints, on both channels."""
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=60)
+    package = str(pathlib.Path(quicksand.__file__).parents[1])  # PYTHONPATH may be relative to another folder
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], cwd=folder, env={**os.environ, "PYTHONPATH": package}, stdout=subprocess.PIPE,
+                          stderr=subprocess.STDOUT, text=True, timeout=60)
     assert done.returncode == 0, done.stdout
     return done.stdout
 
