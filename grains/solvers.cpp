@@ -565,6 +565,20 @@ bool is_narrow(const Problem<dim>& problem, std::size_t contacts) {
   return contacts <= widest * layers;
 }
 
+// To look costs less than sweeps up to that many contacts; in more of them only what sweeps could not solve is worth it.
+constexpr std::size_t look_first = 1000;
+
+// Newton's method in a narrow scene. It converges quadratically and factorises in no time, so a thousandth of the tolerance costs an iteration
+// or two; an iterate within the tolerance itself may still have forces wrong by their own size, because residuals are local.
+template <int dim>
+SolveReport solve_narrow(Problem<dim>& problem, SolverSettings settings) {
+  const double tolerance = settings.tolerance, worst = settings.worst;
+  settings.tolerance *= 1e-3, settings.worst *= 1e-3;
+  SolveReport report = solve_newton(problem, settings);
+  report.converged |= report.residual <= tolerance && report.worst <= worst;
+  return report;
+}
+
 template <int dim>
 SolveReport solve_auto(Problem<dim>& problem, const SolverSettings& settings) {
   SolverSettings few = settings;
@@ -573,14 +587,15 @@ SolveReport solve_auto(Problem<dim>& problem, const SolverSettings& settings) {
   const std::size_t contacts = std::accumulate(problem.count.begin(), problem.count.end(), problem.wall_contacts.size());
   SolveReport report;
   report.converged = false;
-  if (contacts >= few_contacts) report = solve_active_set(problem, few);
   auto go_on = [&](const SolveReport& more) {
     report = {report.sweeps + more.sweeps, report.updates + more.updates, more.residual, more.worst, more.converged};
   };
-  const bool newton = !report.converged && contacts <= newton_contacts<dim>, narrow = newton && is_narrow(problem, contacts);
-  if (narrow) go_on(solve_newton(problem, few));
+  bool narrow = contacts <= look_first && is_narrow(problem, contacts);
+  if (narrow) go_on(solve_narrow(problem, few));
+  if (!report.converged && contacts >= few_contacts) go_on(solve_active_set(problem, few));
+  if (!report.converged && contacts > look_first && contacts <= newton_contacts<dim> && (narrow = is_narrow(problem, contacts))) go_on(solve_narrow(problem, few));
   if (!report.converged && (contacts < few_contacts || settings.max_sweeps > local_sweeps)) go_on(solve_accelerated(problem, settings));
-  if (!report.converged && newton && !narrow) go_on(solve_newton(problem, few));
+  if (!report.converged && contacts <= newton_contacts<dim> && !narrow) go_on(solve_newton(problem, few));
   if (!report.converged) go_on(solve_nlgs(problem, settings));
   return report;
 }
