@@ -15,6 +15,9 @@ namespace quicksand::fluid {
 
 namespace {
 
+// Linear systems within Newton's iteration: what they leave is taken up by the next one. Tighter ones cost more than they save.
+constexpr double newton_forcing = 1e-3;
+
 double seconds() { return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count(); }
 
 template <int dim>
@@ -567,7 +570,7 @@ std::vector<double> Fluid<dim>::times_matrix(const std::vector<double>& x) const
 // The unknowns at the end of a step, or of a steady flow. Solved for what is missing to a start that satisfies the conditions, in the
 // frames of the held nodes, and scaled so that pressure and flux weigh the same.
 template <int dim>
-std::vector<double> Fluid<dim>::solve(const char* function, const std::vector<double>& start, const TimeWeights& time, bool newton, Report& report) {
+std::vector<double> Fluid<dim>::solve(const char* function, const std::vector<double>& start, const TimeWeights& time, bool newton, double tolerance, Report& report) {
   const double begun = seconds();
   velocity_order() == 1 ? assemble<1>(time, newton) : assemble<2>(time, newton);
   const double assembled = seconds();
@@ -639,7 +642,7 @@ std::vector<double> Fluid<dim>::solve(const char* function, const std::vector<do
     solver_ = std::make_unique<LinearSolver>(space_.begin, space_.end, space_.dofs(), space_.row_start, space_.column, linear, velocity_order() == 1 ? dim + 1 : 1, pressures);
   }
   std::vector<double> change(space_.dofs(), 0.0);
-  const LinearReport linear = solver_->solve(values, missing, std::span(change).subspan(space_.begin, own));
+  const LinearReport linear = solver_->solve(values, missing, std::span(change).subspan(space_.begin, own), tolerance);
   report.linear_iterations += linear.iterations;
   report.factorisations += linear.factorised;
   share(change, space_.first_of_rank);
@@ -759,7 +762,7 @@ std::vector<double> Fluid<dim>::solve_step(double t, const TimeWeights& time, Re
   std::vector<double> x = guess_;
   const bool newton = settings.advection == Advection::newton;
   for (int k = 0;; ++k) {
-    std::vector<double> next = solve("step", x, time, newton && k > 0, report);
+    std::vector<double> next = solve("step", x, time, newton && k > 0, newton ? newton_forcing : 0.0, report);
     ++report.newton_iterations;
     report.change = relative_change(next, x);
     x.swap(next);
@@ -843,7 +846,7 @@ Report Fluid<dim>::solve_steady() {
   const bool linear = settings.advection == Advection::none || properties.density == 0;
   for (int k = 0;; ++k) {
     guess_ = x;
-    std::vector<double> next = solve("solve_steady", x, time, !linear && k > 2, report);
+    std::vector<double> next = solve("solve_steady", x, time, !linear && k > 2, linear ? 0.0 : newton_forcing, report);
     ++report.newton_iterations;
     report.change = relative_change(next, x);
     x.swap(next);

@@ -154,7 +154,7 @@ class Fluid {
   void assemble(const TimeWeights& time, bool newton);
   template <int order>
   void add_boundaries();
-  std::vector<double> solve(const char* function, const std::vector<double>& start, const TimeWeights& time, bool newton, Report& report);
+  std::vector<double> solve(const char* function, const std::vector<double>& start, const TimeWeights& time, bool newton, double tolerance, Report& report);
   std::vector<double> times_matrix(const std::vector<double>& x) const;
   std::vector<double> eps_change(double dt) const;
   std::vector<int> node_numbers() const;

@@ -155,7 +155,7 @@ LinearSolver::~LinearSolver() = default;
 
 void LinearSolver::forget() { s_->keep_factors = false, s_->scale = 0.0; }
 
-LinearReport LinearSolver::solve(std::span<const double> values, std::span<const double> b, std::span<double> x) {
+LinearReport LinearSolver::solve(std::span<const double> values, std::span<const double> b, std::span<double> x, double tolerance) {
   LinearReport report;
   if (const int bs = s_->block; bs > 1) {
     const int* columns = s_->block_column.data();
@@ -177,7 +177,7 @@ LinearReport LinearSolver::solve(std::span<const double> values, std::span<const
   for (bool old = s_->keep_factors;; old = false) {
     PETSC(KSPSetReusePreconditioner(s_->ksp, old ? PETSC_TRUE : PETSC_FALSE));
     // With old factors no more than it costs to make new ones is tried.
-    PETSC(KSPSetTolerances(s_->ksp, PETSC_DEFAULT, std::max(s_->settings.tolerance * s_->scale, 1e-300), PETSC_DEFAULT, old ? 4 * s_->settings.most_with_old_factors : s_->settings.max_iterations));
+    PETSC(KSPSetTolerances(s_->ksp, std::max(tolerance, s_->settings.tolerance), std::max(s_->settings.tolerance * s_->scale, 1e-300), PETSC_DEFAULT, old ? 2 * s_->settings.most_with_old_factors : s_->settings.max_iterations));
     const PetscErrorCode error = KSPSolve(s_->ksp, s_->b, s_->x);
     KSPConvergedReason reason = KSP_DIVERGED_PC_FAILED;
     PetscInt iterations = 0;

@@ -48,8 +48,8 @@ class LinearSolver {
   LinearSolver(int begin, int end, int size, const std::vector<int>& row_start, const std::vector<int>& column, LinearSettings settings,
                int block = 1, const std::vector<int>& pressures = {}, const std::string& prefix = "");
   ~LinearSolver();
-  // x of this rank's rows from 0; `values` along row_start and column. Numbers that differ between ranks: the same report on all.
-  LinearReport solve(std::span<const double> values, std::span<const double> b, std::span<double> x);
+  // x of this rank's rows from 0; `values` along row_start and column. A looser tolerance than that of the settings is relative to this system.
+  LinearReport solve(std::span<const double> values, std::span<const double> b, std::span<double> x, double tolerance = 0.0);
   void forget();  // factors and scales of earlier systems
 
  private:
