@@ -75,6 +75,26 @@ def test_a_program_may_use_the_meshes_and_one_that_does_not_needs_no_gmsh(prefix
     run(*configure, "-B", tmp_path / "dry", "-DCMAKE_DISABLE_FIND_PACKAGE_gmsh=ON")
 
 
+def test_a_program_may_solve_a_flow(prefix, tmp_path):
+    (tmp_path / "flow.cpp").write_text("""
+        #include <quicksand/fluid/fluid.hpp>
+        #include <quicksand/meshes/shapes.hpp>
+        #include <cstdio>
+        using namespace quicksand::fluid;
+        int main() {
+          Fluid<2> flow(std::make_shared<Mesh<2>>(quicksand::meshes::channel(2.0, 1.0, 0.25, true)), 2, {1.0, 0.5, {12.0, 0.0}});
+          flow.set_wall("walls", {});
+          flow.solve_steady();
+          std::printf("%.6f\\n", flow.probe(std::array{Vec<2>(1.0, 0.5)})[0].velocity[0]);
+        }""")
+    (tmp_path / "CMakeLists.txt").write_text("cmake_minimum_required(VERSION 3.25)\nproject(flow LANGUAGES CXX)\nset(CMAKE_CXX_STANDARD 20)\n"
+                                             "find_package(quicksand REQUIRED COMPONENTS fluid)\n"
+                                             "add_executable(flow flow.cpp)\ntarget_link_libraries(flow quicksand::fluid)\n")
+    run("cmake", "-G", "Ninja", "-S", tmp_path, f"-DCMAKE_PREFIX_PATH={prefix}", "-B", tmp_path / "build")
+    run("cmake", "--build", tmp_path / "build")
+    assert run(tmp_path / "build" / "flow") == "3.000000\n"  # rho g h^2 / (8 eta)
+
+
 def test_one_version_everywhere():
     version, = re.findall(r"project\(quicksand VERSION (\S+)", (ROOT / "CMakeLists.txt").read_text())
     assert re.search(rf"^version: {re.escape(version)}$", (ROOT / "CITATION.cff").read_text(), re.M)

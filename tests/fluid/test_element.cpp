@@ -1,0 +1,145 @@
+// Shape functions, quadrature, and the element's system of equations: what must hold on any simplex.
+#include "fluid/equations.hpp"
+
+#include <gtest/gtest.h>
+
+#include <random>
+
+namespace quicksand::fluid {
+namespace {
+
+template <class T>
+class Element : public ::testing::Test {};
+template <int d, int o>
+struct Case {
+  static constexpr int dim = d, order = o;
+};
+using Cases = ::testing::Types<Case<2, 1>, Case<2, 2>, Case<3, 1>, Case<3, 2>>;
+TYPED_TEST_SUITE(Element, Cases);
+
+double factorial(int n) { return n <= 1 ? 1.0 : n * factorial(n - 1); }
+
+template <int dim>
+std::array<Vec<dim>, dim + 1> corners() {
+  std::array<Vec<dim>, dim + 1> x;
+  for (int a = 0; a <= dim; ++a)
+    for (int i = 0; i < dim; ++i) x[a][i] = (a == i + 1 ? 0.7 : 0.0) + 0.1 * std::sin(3.0 * a + 5.0 * i);
+  return x;
+}
+
+// int of L_0^a L_1^b L_2^c over a simplex, over its volume: dim! a! b! c! / (dim + a + b + c)!
+TYPED_TEST(Element, quadrature_is_exact_for_products_of_two_shape_functions) {
+  constexpr int dim = TypeParam::dim, order = TypeParam::order;
+  for (int a = 0; a <= 2 * order; ++a)
+    for (int b = 0; a + b <= 2 * order; ++b)
+      for (int c = 0; a + b + c <= 2 * order; ++c) {
+        double sum = 0.0;
+        for (const auto& point : quadrature<dim, order>()) sum += point.weight * std::pow(point.l[0], a) * std::pow(point.l[1], b) * std::pow(point.l[2], c);
+        EXPECT_NEAR(sum, factorial(dim) * factorial(a) * factorial(b) * factorial(c) / factorial(dim + a + b + c), 1e-14) << a << b << c;
+      }
+}
+
+TYPED_TEST(Element, shape_functions_sum_to_one_and_their_gradients_are_their_slopes) {
+  constexpr int dim = TypeParam::dim, order = TypeParam::order;
+  const Geometry<dim> g = geometry<dim>(corners<dim>());
+  Barycentric<dim> l{};
+  for (int a = 0; a <= dim; ++a) l[a] = (a + 1.0) / ((dim + 1) * (dim + 2) / 2);
+  const auto n = shapes<dim, order>(l);
+  const auto slope = shape_gradients<dim, order>(l, g.grad_l);
+  double sum = 0.0;
+  for (const double value : n) sum += value;
+  EXPECT_NEAR(sum, 1.0, 1e-15);
+  const double h = 1e-5;
+  for (int axis = 0; axis < dim; ++axis) {
+    auto at = [&](double way) {
+      Barycentric<dim> there = l;
+      for (int a = 0; a <= dim; ++a) there[a] += way * g.grad_l[a][axis];
+      return shapes<dim, order>(there);
+    };
+    for (std::size_t a = 0; a < n.size(); ++a) EXPECT_NEAR((at(h)[a] - at(-h)[a]) / (2 * h), slope[a][axis], 1e-9);
+  }
+}
+
+template <int dim, int order>
+struct Setup {
+  ElementInput<dim, order> in;
+  Properties<dim> fluid;
+  std::vector<Reaction<dim>> reaction;
+  Eigen::Matrix<double, element_dofs<dim, order>, 1> x;
+
+  Setup() {
+    std::mt19937 random(3);
+    std::uniform_real_distribution<double> any(-1, 1);
+    auto vector = [&] { return Vec<dim>(Vec<dim>::NullaryExpr([&] { return any(random); })); };
+    in.x = corners<dim>();
+    for (int t = 0; t < 3; ++t)
+      for (int a = 0; a < in.n; ++a) in.eps[t][a] = 0.6 + 0.3 * any(random), in.flux[t][a] = vector();
+    for (auto& w : in.mesh_velocity) w = vector();
+    for (std::size_t q = 0; q < quadrature<dim, order>().size(); ++q) reaction.push_back({3.0 + any(random), vector(), vector()});
+    in.reaction = reaction.data();
+    fluid.density = 1.3, fluid.viscosity = 0.2, fluid.gravity = vector();
+    for (int a = 0; a < in.n; ++a) x.template segment<dim>(dof_of<dim>(a)) = in.flux[0][a];
+    for (int a = 0; a <= dim; ++a) x[dof_of<dim>(a) + dim] = any(random);
+  }
+};
+
+// With the guess for the solution, Newton's system and that of the lagged advection leave the same residual.
+TYPED_TEST(Element, newtons_system_and_the_lagged_one_agree_where_the_guess_is_the_solution) {
+  constexpr int dim = TypeParam::dim, order = TypeParam::order;
+  Setup<dim, order> setup;
+  const TimeWeights bdf2{15.0, -20.0, 5.0};
+  ElementSystem<dim, order> lagged, newton;
+  element_system<dim, order>(setup.in, setup.fluid, bdf2, lagged);
+  setup.in.newton = true;
+  element_system<dim, order>(setup.in, setup.fluid, bdf2, newton);
+  EXPECT_GT((newton.a - lagged.a).norm(), 1e-3 * lagged.a.norm());
+  const Eigen::VectorXd one = lagged.a * setup.x - lagged.b, other = newton.a * setup.x - newton.b;
+  EXPECT_LT((one - other).norm(), 1e-12 * lagged.a.norm() * setup.x.norm());
+}
+
+// At rest, grad p = rho g balances whatever eps and beta are: every row of the residual is zero.
+TYPED_TEST(Element, hydrostatic_pressure_at_rest_leaves_no_residual_in_any_void_fraction) {
+  constexpr int dim = TypeParam::dim, order = TypeParam::order;
+  Setup<dim, order> setup;
+  for (auto& flux : setup.in.flux) flux.fill(Vec<dim>::Zero());
+  for (auto& w : setup.in.mesh_velocity) w.setZero();
+  setup.in.eps[1] = setup.in.eps[2] = setup.in.eps[0];
+  for (auto& reaction : setup.reaction) reaction.beta_target.setZero(), reaction.force.setZero();
+  setup.x.setZero();
+  for (int a = 0; a <= dim; ++a) setup.x[dof_of<dim>(a) + dim] = setup.fluid.density * setup.fluid.gravity.dot(setup.in.x[a]) + 4.0;
+  ElementSystem<dim, order> system;
+  element_system<dim, order>(setup.in, setup.fluid, {15.0, -20.0, 5.0}, system);
+  EXPECT_LT((system.a * setup.x - system.b).cwiseAbs().maxCoeff(), 1e-13);
+  setup.x[dof_of<dim>(1) + dim] += 0.1;
+  EXPECT_GT((system.a * setup.x - system.b).cwiseAbs().maxCoeff(), 1e-3);
+}
+
+// A fluid that moves as a whole, and the mesh with it, through an eps that moves along: no inertia, no viscous force, no divergence.
+TYPED_TEST(Element, a_fluid_that_moves_with_the_mesh_as_a_whole_feels_no_force) {
+  constexpr int dim = TypeParam::dim, order = TypeParam::order;
+  Setup<dim, order> setup;
+  setup.fluid.gravity.setZero();
+  setup.in.reaction = nullptr;
+  const Vec<dim> u = Vec<dim>::LinSpaced(0.4, 1.1);
+  setup.in.mesh_velocity.fill(u);
+  for (int a = dim + 1; a < setup.in.n; ++a) {  // eps linear: eps u is in the space then
+    const auto [i, j] = simplex_edges<dim>[a - dim - 1];
+    setup.in.eps[0][a] = 0.5 * (setup.in.eps[0][i] + setup.in.eps[0][j]);
+  }
+  setup.in.eps[1] = setup.in.eps[2] = setup.in.eps[0];
+  setup.x.setZero();
+  for (int a = 0; a < setup.in.n; ++a) {
+    for (auto& flux : setup.in.flux) flux[a] = setup.in.eps[0][a] * u;
+    setup.x.template segment<dim>(dof_of<dim>(a)) = setup.in.flux[0][a];
+  }
+  ElementSystem<dim, order> system;
+  element_system<dim, order>(setup.in, setup.fluid, {15.0, -20.0, 5.0}, system);
+  const Eigen::VectorXd residual = system.a * setup.x - system.b;
+  for (int a = 0; a < setup.in.n; ++a) EXPECT_LT(residual.segment(dof_of<dim>(a), dim).norm(), 1e-13);
+  setup.in.mesh_velocity[0] += Vec<dim>::Constant(0.1);  // eps slides along: the divergence shows
+  element_system<dim, order>(setup.in, setup.fluid, {15.0, -20.0, 5.0}, system);
+  EXPECT_GT((system.a * setup.x - system.b).head(dim).norm(), 1e-5);
+}
+
+}  // namespace
+}  // namespace quicksand::fluid
