@@ -2,6 +2,7 @@
 
 #include "locator.hpp"
 
+#include <Eigen/Geometry>
 #include <Eigen/Sparse>
 
 #include <fmt/format.h>
@@ -900,23 +901,49 @@ void Fluid<dim>::account(Report& report, const std::vector<double>& x, const Tim
   report.volume_error = size > 0 ? std::abs(report.pore_volume_rate - report.net_inflow) / size : 0.0;
 }
 
+// Calls use(point, force): what the fluid does to a boundary, the pressure at the facets' quadrature points, the viscous traction at nodes.
+// Where boundaries meet, each has its share of a node, by area.
 template <int dim>
-Vec<dim> Fluid<dim>::force(const std::string& boundary) const {
-  const int k = boundary_index("force", boundary);
-  if (reaction_at_nodes_.empty()) throw std::logic_error("force: nothing is known before the first step");
-  std::vector<double> all(space_.nodes(), 0.0), own(space_.nodes(), 0.0);  // areas of facets at each node
+template <class Use>
+void Fluid<dim>::loads(const char* function, const std::string& boundary, Use&& use) const {
+  const int k = boundary_index(function, boundary);
+  if (reaction_at_nodes_.empty()) throw std::logic_error(fmt::format("{}: nothing is known before the first step", function));
+  std::vector<double> area(space_.nodes(), 0.0);  // of facets at each node
   for (std::size_t f = 0; f < mesh_->facets.size(); ++f) {
     if (mesh_->facet_elements[f][1] >= 0) continue;
-    const double area = FacetView<dim>(*mesh_, position_, static_cast<int>(f)).area.norm();
-    for (const auto& [node, x] : facet_nodes(static_cast<int>(f))) all[node] += area, own[node] += mesh_->boundary[f] == k ? area : 0.0;
+    const double own = FacetView<dim>(*mesh_, position_, static_cast<int>(f)).area.norm();
+    for (const auto& [node, x] : facet_nodes(static_cast<int>(f))) area[node] += own;
   }
-  Vec<dim> sum = Vec<dim>::Zero();
-  for (int node = 0; node < space_.nodes(); ++node)
-    if (own[node] > 0) sum -= own[node] / all[node] / eps_[1][node] * Eigen::Map<const Vec<dim>>(&reaction_at_nodes_[space_.first_dof[node]]);
   for (const int f : facets_of_[k]) {
     const FacetView<dim> facet(*mesh_, position_, f);
-    for (const int a : facet.corner) sum += x_[0][space_.pressure_dof(space_.vertex[mesh_->elements[facet.element][a]])] * facet.area / dim;
+    if (mesh_->facet_elements[f][1] < 0)
+      for (const auto& [node, x] : facet_nodes(f))
+        use(x, Vec<dim>(-facet.area.norm() / area[node] / eps_[1][node] * Eigen::Map<const Vec<dim>>(&reaction_at_nodes_[space_.first_dof[node]])));
+    const auto& corners = mesh_->elements[facet.element];
+    along<dim>(facet, [&](const Barycentric<dim>& l, double weight) {
+      Vec<dim> x = Vec<dim>::Zero();
+      double p = 0.0;
+      for (int a = 0; a <= dim; ++a) x += l[a] * position_[corners[a]], p += l[a] * x_[0][space_.pressure_dof(space_.vertex[corners[a]])];
+      use(x, Vec<dim>(weight * p * facet.area));
+    });
   }
+}
+
+template <int dim>
+Vec<dim> Fluid<dim>::force(const std::string& boundary) const {
+  Vec<dim> sum = Vec<dim>::Zero();
+  loads("force", boundary, [&](const Vec<dim>&, const Vec<dim>& force) { sum += force; });
+  return sum;
+}
+
+template <int dim>
+auto Fluid<dim>::torque(const std::string& boundary, const Vec<dim>& centre) const -> Moment {
+  Moment sum = Moment::Zero();
+  loads("torque", boundary, [&](const Vec<dim>& x, const Vec<dim>& force) {
+    const Vec<dim> arm = x - centre;
+    if constexpr (dim == 2) sum[0] += arm[0] * force[1] - arm[1] * force[0];
+    else sum += arm.cross(force);
+  });
   return sum;
 }
 

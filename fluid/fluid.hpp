@@ -103,6 +103,9 @@ class Fluid {
 
   // Of the fluid on a boundary [N] (2D: N/m): pressure, and the viscous traction as the momentum balance has it.
   Vec<dim> force(const std::string& boundary) const;
+  // Its moment about a point: in 2D one number, along the axis out of the plane [N m/m], in 3D a vector [N m].
+  using Moment = Eigen::Matrix<double, dim == 2 ? 1 : 3, 1>;
+  Moment torque(const std::string& boundary, const Vec<dim>& centre) const;
   // int (U - eps w) . n over the last step along a named boundary, or named facets inside [m^dim/s]: relative to the mesh.
   double flux(const std::string& boundary) const;
   struct Probe {
@@ -157,6 +160,8 @@ class Fluid {
   std::vector<double> solve(const char* function, const std::vector<double>& start, const TimeWeights& time, bool newton, double tolerance, Report& report);
   std::vector<double> times_matrix(const std::vector<double>& x) const;
   std::vector<double> eps_change(double dt) const;
+  template <class Use>
+  void loads(const char* function, const std::string& boundary, Use&& use) const;
   std::vector<int> node_numbers() const;
   Vec<dim> mesh_velocity_at(int node) const;
   std::vector<std::pair<int, Vec<dim>>> facet_nodes(int facet) const;

@@ -241,6 +241,14 @@ void add_fluid(py::module_& m, const char* name) {
       .def_property_readonly("dofs", [](const F& f) { return f.space().dofs(); }, "unknowns")
       .def_property_readonly("dim", [](const F&) { return dim; })
       .def("force", &F::force, "boundary"_a, "Of the fluid on a boundary (dim,) [N] (2D: N/m).")
+      .def("torque",
+           [](const F& f, const std::string& boundary, const py::object& centre) -> py::object {
+             const Vec<dim> about = centre.is_none() ? Vec<dim>(Vec<dim>::Zero()) : vectors<dim>(centre, 1, "torque: centre")[0];
+             const auto moment = f.torque(boundary, about);
+             if constexpr (dim == 2) return py::cast(moment[0]);
+             else return py::cast(moment);
+           },
+           "boundary"_a, "centre"_a = py::none(), "Moment of that force about a point (dim,) [m], by default the origin: 2D a number, anticlockwise [N m/m], 3D (3,) [N m].")
       .def("flux", &F::flux, "boundary"_a, "int eps (u - w) . n over named facets, out of the domain or along their normal, w the velocity of the mesh; mean of the last step [m^3/s] (2D: m^2/s).")
       .def("probe",
            [](const F& f, const py::object& points) {

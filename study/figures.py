@@ -34,7 +34,7 @@ def _styled(draw):
 
 
 @_styled
-def plot_series(path, time, panels, steady_from=None):
+def plot_series(path, time, panels, steady_from=None, red="mean"):
     """Time series below each other, the steady window shaded and its means drawn.
 
     Parameters
@@ -46,6 +46,8 @@ def plot_series(path, time, panels, steady_from=None):
         series (n,) array; mean is a number or None. The few most extreme samples may leave the panel.
     steady_from : float, optional
         Start of the steady window [s].
+    red : str
+        What the numbers drawn over it are.
     """
     figure, axes = _figure(len(panels), 1, (8, 1.9 * len(panels)), sharex=True, squeeze=False)
     for axis, (label, series, mean) in zip(axes[:, 0], panels):
@@ -65,7 +67,7 @@ def plot_series(path, time, panels, steady_from=None):
     axes[-1, 0].set_xlabel("$t$ [s]")
     axes[-1, 0].set_xlim(0, time[-1])
     if steady_from is not None:
-        axes[0, 0].set_title(f"shaded: steady from $t$ = {steady_from:.2f} s, red: mean", fontsize=9, color=INK, loc="right")
+        axes[0, 0].set_title(f"shaded: steady from $t$ = {steady_from:.2f} s, red: {red}", fontsize=9, color=INK, loc="right")
     figure.savefig(path)
 
 
@@ -257,3 +259,70 @@ def plot_lines(path, x_label, y_label, panels, scales=("log", "log"), steps=Fals
         axis.legend()
     axes[0, 0].set_ylabel(y_label)
     figure.savefig(path)
+
+
+@_styled
+def plot_along(path, x_label, panels):
+    """Curves over the same axis, a panel below the other for each quantity.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+    x_label : str
+    panels : list of (y_label, [(label, colour, x, y), ...])
+        x, y (n,) arrays. Colours in FAINT are drawn wide, for what others should lie on.
+    """
+    figure, axes = _figure(len(panels), 1, (8, 2.2 * len(panels)), sharex=True, squeeze=False)
+    for axis, (y_label, curves) in zip(axes[:, 0], panels):
+        for label, colour, x, y in curves:
+            axis.plot(x, y, color=colour, label=label, linewidth=3.5 if colour == FAINT else 1.0)
+        axis.set_ylabel(y_label)
+        if len(curves) > 1:
+            axis.legend()
+    axes[-1, 0].set_xlabel(x_label)
+    figure.savefig(path)
+
+
+@_styled
+def plot_flow(path, mesh, panels, window=None, title=""):
+    """Fields of a plane flow in colours on its mesh, a panel each, with streamlines.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+    mesh : quicksand.meshes.Mesh2D
+    panels : list of (label, values, limit, velocity)
+        values at the nodes of the mesh (n,). limit: colours from -limit to limit, or (low, high), values beyond in the colour of the end; None:
+        all there are. velocity at the nodes (n, 2) whose streamlines are drawn, or None.
+    window : ((x, x), (y, y)), optional
+        What is drawn [m]; all by default.
+    title : str
+    """
+    from matplotlib.ticker import MaxNLocator
+    from matplotlib.tri import LinearTriInterpolator, Triangulation
+
+    x, y = mesh.nodes.T
+    triangles = Triangulation(x, y, mesh.elements)
+    (left, right), (bottom, top) = window or ((x.min(), x.max()), (y.min(), y.max()))
+    wide = right - left > 1.5 * (top - bottom)
+    width = 10 if wide else 6.5  # of a panel
+    height = 0.5 + 0.85 * width * (top - bottom) / (right - left)
+    rows, columns = (len(panels), 1) if wide else (1, len(panels))
+    figure, axes = _figure(rows, columns, (columns * width, rows * height + 0.4), squeeze=False)
+    for axis, (label, values, limit, velocity) in zip(axes.flat, panels):
+        signed = limit is not None and np.ndim(limit) == 0
+        low, high = (-limit, limit) if signed else (values.min(), values.max()) if limit is None else limit
+        colours = axis.tricontourf(triangles, values, levels=np.linspace(low, high, 42 if signed else 33), cmap="RdBu_r" if signed else "viridis" if velocity is None else "GnBu",
+                                   extend="neither" if limit is None else "both")
+        if velocity is not None:
+            # Four points across an element of average size follow what the triangles know; streamplot needs them evenly spaced.
+            spacing = max(0.5 * np.sqrt(mesh.volume / len(mesh.elements)), (right - left) / 400)
+            across, up = (np.linspace(low, high, max(2, round((high - low) / spacing))) for low, high in ((left, right), (bottom, top)))
+            grid = np.meshgrid(across, up)
+            u, v = (LinearTriInterpolator(triangles, component)(*grid) for component in velocity.T)
+            axis.streamplot(across, up, u, v, density=(3.0, 3.0 * (top - bottom) / (right - left)) if wide else 1.4, color=INK, linewidth=0.5, arrowsize=0.6)
+        axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="$x$ [m]", ylabel="$y$ [m]")
+        axis.grid(False)
+        figure.colorbar(colours, cax=axis.inset_axes([1.01, 0.0, 0.1 / width, 1.0]), label=label, ticks=MaxNLocator(6))
+    figure.suptitle(title, fontsize=10)
+    figure.savefig(path, bbox_inches="tight")

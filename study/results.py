@@ -31,7 +31,7 @@ def _plain(value):
     return value
 
 
-def print_summary(title, results, units, references=None):
+def print_summary(title, results, units, references=None, source="thesis", digits=4):
     """Print results as a table, with NAME_err and NAME_std beside NAME.
 
     Parameters
@@ -42,16 +42,20 @@ def print_summary(title, results, units, references=None):
         The quantities to print, in this order, and their units.
     references : dict, optional
         Published values as text, by quantity; adds a column.
+    source : str
+        Its heading.
+    digits : int
+        Of values.
     """
     table = [["quantity", "unit", "value", "+- error", "(std)"]]
     for name, unit in units.items():
         value = results[name]
-        table.append([name, unit, str(value) if isinstance(value, int) else _text(value, "{:.4g}") or "-",
+        table.append([name, unit, str(value) if isinstance(value, int) else _text(value, f"{{:.{digits}g}}") or "-",
                       _text(results.get(f"{name}_err"), "+- {:.2g}"), _text(results.get(f"{name}_std"), "({:.2g})")])
     if references:
         for row in table:
             row.append(references.get(row[0], ""))
-        table[0][-1] = "thesis"
+        table[0][-1] = source
     widths = [max(map(len, column)) for column in zip(*table)]
     print(title)
     for row in table:
