@@ -31,7 +31,7 @@ import manufactured
 from quicksand import fluid, meshes, study
 
 VISCOSITY = {"V1": 0.1, "V2": 0.1, "unsteady": 0.1, "cylinder": 1e-3}  # [Pa s]
-SIZES = {"V1": (8, 16, 32, 64, 128), "V2": (8, 16, 32, 64, 128), "unsteady": (8, 16, 32, 64), "cylinder": (0.02, 0.01, 0.005, 0.0025)}
+SIZES = {"V1": (4, 8, 16, 32, 64, 128), "V2": (4, 8, 16, 32, 64, 128), "unsteady": (4, 8, 16, 32, 64), "cylinder": (0.02, 0.01, 0.005, 0.0025)}
 COLOURS = {"p1p1": "#1f5fa8", "p1p1, ilu": "#7fb0e0", "p2p1": "#c2452d", "dolfinx": "#8a5a00"}
 C_D, DP = 5.57953523, 0.11752017  # M. Schaefer, S. Turek (1996), and later refinements
 

@@ -149,6 +149,9 @@ LinearSolver::LinearSolver(int begin, int end, int size, const std::vector<int>&
   }
   PETSC(KSPSetResidualHistory(s_->ksp, s_->history.data(), 1, PETSC_TRUE));
   PETSC(KSPSetFromOptions(s_->ksp));
+  PetscInt most = 0;
+  PETSC(KSPGetTolerances(s_->ksp, &s_->settings.tolerance, nullptr, nullptr, &most));  // -ksp_rtol, -ksp_max_it
+  s_->settings.max_iterations = static_cast<int>(most);
 }
 
 LinearSolver::~LinearSolver() = default;

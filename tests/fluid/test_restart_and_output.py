@@ -70,6 +70,24 @@ def test_frames_hold_the_flow_and_paraview_finds_it(tmp_path, element, cell, nod
     assert text.count(f'TopologyType="{cell}"') == 2 and 'Name="velocity" AttributeType="Vector" Center="Node"' in text
 
 
+def test_petsc_options_pass_through(tmp_path):
+    (tmp_path / "script.py").write_text("""
+from quicksand import fluid, meshes
+fluid.petsc_options("-ksp_max_it 1 -pc_type none")
+flow = fluid.Fluid(meshes.box([1.0, 1.0], counts=[4, 4]), density=1.0, viscosity=1.0)
+for name in flow.mesh.boundary_names:
+    flow.wall(name, [1.0, 0.0] if name == "top" else None)
+try:
+    flow.step(0.1)
+except fluid.NotConverged as error:
+    print(error)
+""")
+    env = {name: value for name, value in os.environ.items() if not name.startswith(("PMIX_", "OMPI_"))} | {"PETSC_OPTIONS": "-ksp_converged_reason"}
+    done = subprocess.run([ROOT / "run", tmp_path / "script.py"], capture_output=True, text=True, timeout=100, env=env)
+    assert "solve did not converge due to DIVERGED_ITS" in done.stdout  # PETSc's own words, from the option in the environment
+    assert "step: velocity and pressure not found in step 1, t = 0 s: DIVERGED_ITS after 1 iterations" in done.stdout
+
+
 SCRIPT = """
 import sys
 import numpy as np
