@@ -199,6 +199,7 @@ class Fluid {
   std::vector<double> reaction_at_nodes_;            // A x - b: what holds the held unknowns
   std::unique_ptr<LinearSolver> solver_;
   double time_ = 0.0, dt_ = 0.0;
+  double pressure_scale_ = 1.0;  // pressures that do as much to the momentum of a node as 1 m/s [Pa s/m]
   int steps_ = 0;
   bool eps_started_ = false;
 };
