@@ -49,7 +49,6 @@ template <int dim>
 class Fluid {
  public:
   Fluid(std::shared_ptr<const Mesh<dim>> mesh, int order, Properties<dim> properties);
-  ~Fluid();
 
   Properties<dim> properties;
   Settings settings;
@@ -177,7 +176,7 @@ class Fluid {
   Space<dim> space_;
   std::vector<Condition> conditions_;  // of each boundary
   std::vector<VectorField<dim>> motion_;  // of each boundary; none: it stays
-  std::unique_ptr<Harmonic> harmonic_;
+  std::shared_ptr<Harmonic> harmonic_;
   int turns_ = 0;
   std::optional<double> mean_pressure_;
   std::vector<Vec<dim>> position_, old_position_;  // of mesh nodes, now and at the start of the step
