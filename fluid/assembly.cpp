@@ -167,7 +167,7 @@ std::vector<double> Fluid<dim>::solve(const char* function, const std::vector<do
       else if (is_pressure[space_.column[k]]) size[1] += std::abs(values[k]);
   }
   sum_over_ranks(size);
-  const double pressure_scale = size[0] / size[1];
+  const double pressure_scale = pressure_scale_ = size[0] / size[1];
   for (int node = 0; node < space_.nodes(); ++node) {
     if (!space_.mine(node)) continue;
     const int first = space_.first_dof[node] - space_.begin, length = space_.row_start[first + 1] - space_.row_start[first];

@@ -113,7 +113,7 @@ void element_system(const ElementInput<dim, order>& in, const Properties<dim>& f
     const Vec<dim> past = time[1] / eps[1] * flux[1] + time[2] / eps[2] * flux[2];  // of du/dt
     const Vec<dim> load = eps[0] * rho * (fluid.gravity - past) + reaction.beta_target + reaction.force +
                           (in.newton ? Vec<dim>(rho * slope * flux[0]) : Vec<dim>::Zero());
-    const double eps_rate = time[0] * eps[0] + time[1] * eps[1] + time[2] * eps[2] - mesh_velocity.dot(grad_eps);  // at a fixed point
+    const double eps_rate = time[0] * (eps[0] - eps[1]) - time[2] * (eps[1] - eps[2]) - mesh_velocity.dot(grad_eps);  // at a fixed point
     const Stabilisation<dim> stab = stabilisation<dim>(g, fluid, relative, time[0], reaction.beta * inv_eps);
     std::array<double, n> inertia;  // what acts along U itself: rho dU/dt, advection, reaction
     for (int b = 0; b < n; ++b) inertia[b] = rho * (time[0] * shape[b] + carried[b]) + reaction.beta * inv_eps * shape[b];
