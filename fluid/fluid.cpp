@@ -604,7 +604,7 @@ std::vector<double> Fluid<dim>::solve(const char* function, const std::vector<do
       else if (is_pressure[space_.column[k]]) size[1] += std::abs(values[k]);
   }
   sum_over_ranks(size);
-  const double pressure_scale = size[0] / size[1];
+  const double pressure_scale = pressure_scale_ = size[0] / size[1];
   for (int node = 0; node < space_.nodes(); ++node) {
     if (!space_.mine(node)) continue;
     const int first = space_.first_dof[node] - space_.begin, length = space_.row_start[first + 1] - space_.row_start[first];
@@ -709,7 +709,8 @@ double Fluid<dim>::mean_pressure(const std::vector<double>& x) const {
   return sum / volume;
 }
 
-// Changes of flux and pressure relative to their sizes, the larger of the two.
+// Changes of flux and pressure relative to their sizes, the larger of the two. One that should vanish is what rounding of the other's forces
+// leaves of it (a fluid at rest under gravity, a body force that needs no pressure): changes within 1e-14 of those are none.
 template <int dim>
 double Fluid<dim>::relative_change(const std::vector<double>& x, const std::vector<double>& before) const {
   std::array<double, 2> change{}, size{};
@@ -718,6 +719,8 @@ double Fluid<dim>::relative_change(const std::vector<double>& x, const std::vect
       const double now = x[space_.first_dof[node] + i], was = before[space_.first_dof[node] + i];
       change[i == dim] += (now - was) * (now - was), size[i == dim] += now * now;
     }
+  const double rounding = std::pow(1e-14 / settings.newton_tolerance, 2), scale = pressure_scale_ * pressure_scale_;
+  size = {size[0] + rounding * size[1] / scale, size[1] + rounding * size[0] * scale};
   double worst = 0.0;
   for (int k = 0; k < 2; ++k)
     if (size[k] > 0) worst = std::max(worst, std::sqrt(change[k] / size[k]));

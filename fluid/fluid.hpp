@@ -198,6 +198,7 @@ class Fluid {
   std::vector<double> values_, b_;                   // this rank's rows, before conditions
   std::vector<double> reaction_at_nodes_;            // A x - b: what holds the held unknowns
   std::unique_ptr<LinearSolver> solver_;
+  double pressure_scale_ = 1.0;  // pressure that weighs as much as a flux of 1 m/s, of the last system [Pa s/m]
   double time_ = 0.0, dt_ = 0.0;
   int steps_ = 0;
   bool eps_started_ = false;
