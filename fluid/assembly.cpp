@@ -213,7 +213,7 @@ std::vector<double> Fluid<dim>::solve(const char* function, const std::vector<do
   const bool finite = std::all_of(change.begin(), change.end(), [](double v) { return std::isfinite(v); });
   if (!linear.converged || !finite)
     throw NotConverged(fmt::format("{}: velocity and pressure not found in step {}, t = {:.6g} s: {} after {} iterations, residual {:.1e}. Likely causes: {}", function,
-                                   steps_ + 1, time_, finite ? linear.reason : "values not finite", linear.iterations, linear.residual,
+                                   steps_ + 1, time_, finite || !linear.converged ? linear.reason : "values not finite", linear.iterations, linear.residual,
                                    "velocities that have blown up (a smaller time step), elements of extreme aspect, parts of the domain without a condition on the pressure"));
   for (int node = 0; node < space_.nodes(); ++node) {
     if (has_frame_[node]) {

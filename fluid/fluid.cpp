@@ -275,8 +275,9 @@ void Fluid<dim>::restore(std::span<const double> state) {
 template <int dim>
 void Fluid<dim>::throw_newton(const char* function, const Report& report) const {
   throw NotConverged(fmt::format("{}: Newton's iteration for the advection in step {}, t = {:.6g} s, still changes by {:.1e} after {} iterations. Likely causes: a flow that has no "
-                                 "steady state or is far from it (lower the Reynolds number in stages, or step in time), a time step too large", function, steps_ + 1, time_, report.change,
-                                 report.newton_iterations));
+                                 "steady state or is far from it (lower the Reynolds number in stages, or step in time), a time step too large{}", function, steps_ + 1, time_, report.change,
+                                 report.newton_iterations,
+                                 report.change < 1e-5 ? ", or rounding: pressures or reactions so large that newton_tolerance cannot be met" : ""));
 }
 
 // Stokes' flow to start from where there is nothing, two iterations with the advection lagged, then Newton's.
