@@ -120,6 +120,16 @@ def test_water_in_and_above_a_bed_at_rest_stays_at_rest(dim, element):
     assert flow.force("bottom")[1] == pytest.approx(-1000 * 9.81 * 0.5, rel=1e-9)  # the pressure of the water alone
 
 
+@pytest.mark.parametrize("element", ELEMENTS)
+def test_the_steady_state_of_water_in_a_closed_box_is_rest(element):
+    mesh, flow = box((3,) * 3, element, density=1000.0, viscosity=1e-3, gravity=(0.0, -9.81, 0.0))
+    for name in mesh.boundary_names:
+        flow.wall(name)
+    flow.solve_steady()
+    driven = 1000 * 9.81 / 3**2 / 1e-3  # what the weight would drive were it not balanced [m/s]
+    assert np.abs(flow.velocity).max() < 1e-11 * driven
+
+
 def inclined(tmp_path, angle, length, height):
     """A channel turned by `angle` around the origin, as gmsh makes it."""
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
