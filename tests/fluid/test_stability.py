@@ -53,3 +53,18 @@ def test_a_plug_enters_a_porous_half_of_any_resistance(element):
     flow.reaction(beta=lambda x, t: 1e6 * 16**2 * (x[:, 0] > 0.5))
     flow.solve_steady()
     assert np.abs(flow.velocity - [1.0, 0.0]).max() < 1e-8
+
+
+def test_newton_ends_where_velocities_are_nothing_but_rounding():
+    """At rest the change of u is as large as u; with p = 0 that of p as large as p. Neither is a failure."""
+    mesh, flow = flow_in_box("p1p1", [1.0] * 3, [4] * 3, 1000.0, 1e-3, (0, -GRAVITY, 0))
+    for name in mesh.boundary_names:
+        flow.wall(name)
+    flow.void_fraction = np.where(mesh.nodes[:, 0] < 0.4, 1.0, 0.05)
+    assert flow.solve_steady().change < 1e-9
+    assert np.abs(flow.velocity).max() < 1e-6
+    _, flow = flow_in_box("p2p1", [6.0, 6.0], (8, 8), 1.0, 0.01, periodic=[True, True])
+    flow.advection = "newton"
+    flow.set_velocity(np.array([1.0, 0.5]) + 1e-9 * np.sin(np.pi / 3 * flow.nodes[:, ::-1]))
+    for _ in range(5):
+        assert flow.step(10.0).newton_iterations <= 10
