@@ -162,14 +162,14 @@ double Fluid<dim>::relative_change(const std::vector<double>& x, const std::vect
   std::array<double, 2> change{}, size{};
   for (int node = 0; node < space_.nodes(); ++node)
     for (int i = 0; i < space_.dofs_at(node); ++i) {
-      const double now = x[space_.first_dof[node] + i], was = before[space_.first_dof[node] + i], scale = i == dim ? 1.0 / pressure_scale_ : 1.0;
-      change[i == dim] += std::pow(scale * (now - was), 2), size[i == dim] += std::pow(scale * now, 2);
+      const double now = x[space_.first_dof[node] + i], was = before[space_.first_dof[node] + i];
+      change[i == dim] += (now - was) * (now - was), size[i == dim] += now * now;
     }
   const double rounding = std::pow(1e-14 / settings.newton_tolerance, 2), scale = pressure_scale_ * pressure_scale_;
   size = {size[0] + rounding * size[1] / scale, size[1] + rounding * size[0] * scale};
   double worst = 0.0;
   for (int k = 0; k < 2; ++k)
-    if (size[k] > 0) worst = std::max(worst, std::sqrt(change[k] / std::max(size[k], 1e-8 * size[1 - k])));
+    if (size[k] > 0) worst = std::max(worst, std::sqrt(change[k] / size[k]));
   return worst;
 }
 

@@ -199,7 +199,6 @@ class Fluid {
   std::unique_ptr<LinearSolver> solver_;
   double pressure_scale_ = 1.0;  // pressure that weighs as much as a flux of 1 m/s, in the last system [Pa s/m]
   double time_ = 0.0, dt_ = 0.0;
-  double pressure_scale_ = 1.0;  // pressures that do as much to the momentum of a node as 1 m/s [Pa s/m]
   int steps_ = 0;
   bool eps_started_ = false;
 };
