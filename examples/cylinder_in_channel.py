@@ -5,7 +5,9 @@
 M. Schaefer and S. Turek, "Benchmark computations of laminar flow around a cylinder" (1996): channel 2.2 m x 0.41 m, cylinder of diameter
 D = 0.1 m around (0.2, 0.2) m, viscosity 0.001 Pa s, density 1 kg/m^3, parabolic inflow of mean velocity U = 2/3 u_max: 2D-1 u_max 0.3 m/s, Reynolds
 number U D/nu = 20; 2D-2 1.5 m/s and 100. 2D-2 starts from rest, with a gust across the wake that the vortices grow from, and is measured over
-its last five periods. The mesh has straight sides: of the polygon in place of the circle come errors of order size^2.
+its last five periods. Elements have straight sides: of the polygon in place of the circle come errors of order size^2. The steady lift is 0.2 % of the
+drag: with p1p1 and 60 000 unknowns it is known to a tenth. At the default size and step the vortices' lift has errors of 1 % to 2 % of the mesh and
+of the step, of opposite sign.
 
 Flags
     --case NAME     2D-1 or 2D-2 (2D-1)

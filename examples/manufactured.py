@@ -13,7 +13,7 @@ Flags
     --case NAME       V1, V2 or unsteady (V1)
     --dim N           2 or 3 (2)
     --element NAME    p1p1 or p2p1 (p1p1)
-    --sizes H ...     element lengths [m] (2D: 1/8 1/16 1/32, 3D: 1/4 1/6 1/8)
+    --sizes H ...     element lengths [m] (2D: 1/8 1/16 1/32; 3D: p1p1 1/6 1/8 1/12, p2p1 1/4 1/6 1/8, which takes a minute)
     --viscosity ETA   [Pa s] (0.1)
     --quick           the two coarsest sizes
     --out DIR         where results.json and orders.png go (out/manufactured)
@@ -107,7 +107,7 @@ def parse_flags():
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("out/manufactured"))
     flags = parser.parse_args()
-    flags.sizes = sorted(flags.sizes or ([1 / 8, 1 / 16, 1 / 32] if flags.dim == 2 else [1 / 4, 1 / 6, 1 / 8]), reverse=True)
+    flags.sizes = sorted(flags.sizes or ([1 / 8, 1 / 16, 1 / 32] if flags.dim == 2 else [1 / 6, 1 / 8, 1 / 12] if flags.element == "p1p1" else [1 / 4, 1 / 6, 1 / 8]), reverse=True)
     if flags.quick:
         flags.sizes = flags.sizes[:2]
     if len(flags.sizes) < 2:

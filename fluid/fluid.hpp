@@ -49,7 +49,6 @@ template <int dim>
 class Fluid {
  public:
   Fluid(std::shared_ptr<const Mesh<dim>> mesh, int order, Properties<dim> properties);
-  ~Fluid();
 
   Properties<dim> properties;
   Settings settings;
@@ -177,7 +176,7 @@ class Fluid {
   Space<dim> space_;
   std::vector<Condition> conditions_;  // of each boundary
   std::vector<VectorField<dim>> motion_;  // of each boundary; none: it stays
-  std::unique_ptr<Harmonic> harmonic_;
+  std::shared_ptr<Harmonic> harmonic_;
   int turns_ = 0;
   std::optional<double> mean_pressure_;
   std::vector<Vec<dim>> position_, old_position_;  // of mesh nodes, now and at the start of the step
@@ -198,8 +197,8 @@ class Fluid {
   std::vector<double> values_, b_;                   // this rank's rows, before conditions
   std::vector<double> reaction_at_nodes_;            // A x - b: what holds the held unknowns
   std::unique_ptr<LinearSolver> solver_;
+  double pressure_scale_ = 1.0;  // pressure that weighs as much as a flux of 1 m/s, in the last system [Pa s/m]
   double time_ = 0.0, dt_ = 0.0;
-  double pressure_scale_ = 1.0;  // pressures that do as much to the momentum of a node as 1 m/s [Pa s/m]
   int steps_ = 0;
   bool eps_started_ = false;
 };

@@ -183,10 +183,11 @@ LinearReport LinearSolver::solve(std::span<const double> values, std::span<const
   std::copy(b.begin(), b.end(), to);
   PETSC(VecRestoreArray(s_->b, &to));
   PETSC(KSPSetOperators(s_->ksp, s_->matrix, s_->matrix));
+  const int most = tolerance > s_->settings.tolerance ? s_->settings.most_with_old_factors / 2 : s_->settings.most_with_old_factors;  // Newton's matrices change more
   for (bool old = s_->keep_factors;; old = false) {
     PETSC(KSPSetReusePreconditioner(s_->ksp, old ? PETSC_TRUE : PETSC_FALSE));
     // With old factors no more than it costs to make new ones is tried.
-    PETSC(KSPSetTolerances(s_->ksp, std::max(tolerance, s_->settings.tolerance), std::max(s_->settings.tolerance * s_->scale, 1e-300), PETSC_DEFAULT, old ? 2 * s_->settings.most_with_old_factors : s_->settings.max_iterations));
+    PETSC(KSPSetTolerances(s_->ksp, std::max(tolerance, s_->settings.tolerance), std::max(s_->settings.tolerance * s_->scale, 1e-300), PETSC_DEFAULT, old ? 2 * most : s_->settings.max_iterations));
     const PetscErrorCode error = KSPSolve(s_->ksp, s_->b, s_->x);
     KSPConvergedReason reason = KSP_DIVERGED_PC_FAILED;
     PetscInt iterations = 0;
@@ -203,7 +204,7 @@ LinearReport LinearSolver::solve(std::span<const double> values, std::span<const
     report.converged = reason > 0;
     report.residual = residual;
     report.reason = KSPConvergedReasons[reason];
-    s_->keep_factors = report.converged && s_->settings.method == Method::direct && iterations <= s_->settings.most_with_old_factors;
+    s_->keep_factors = report.converged && s_->settings.method == Method::direct && iterations <= most;
     if (report.converged || !old) break;
   }
   const PetscScalar* from;

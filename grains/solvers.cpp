@@ -535,7 +535,7 @@ template <int dim>
 constexpr std::size_t newton_contacts = dim == 2 ? 10000 : 2000;
 
 // Few contacts side by side and many layers: W fills in little, and sweeps would have to carry forces through all layers. Layers are
-// those of a walk along the contacts that starts at the walls, and again at a grain of each part that it did not reach.
+// those of a walk along the contacts that starts at one grain of each connected part.
 template <int dim>
 bool is_narrow(const Problem<dim>& problem, std::size_t contacts) {
   constexpr std::size_t widest = 4;  // contacts a layer
@@ -558,8 +558,6 @@ bool is_narrow(const Problem<dim>& problem, std::size_t contacts) {
       for (const std::size_t end = reached.size(); done < end; ++done)
         for (int k = first[reached[done]]; k < first[reached[done] + 1]; ++k) reach(neighbour[k]);
   };
-  for (const WallContact<dim>& c : problem.wall_contacts) reach(c.j);
-  walk();
   for (int body = 0; body < bodies; ++body)
     if (first[body] < first[body + 1]) reach(body), walk();
   return contacts <= widest * layers;
@@ -573,7 +571,7 @@ constexpr std::size_t look_first = 1000;
 template <int dim>
 SolveReport solve_narrow(Problem<dim>& problem, SolverSettings settings) {
   const double tolerance = settings.tolerance, worst = settings.worst;
-  settings.tolerance *= 1e-3, settings.worst *= 1e-3;
+  settings.tolerance = std::max(1e-3 * tolerance, std::min(tolerance, 1e-8)), settings.worst *= settings.tolerance / tolerance;
   SolveReport report = solve_newton(problem, settings);
   report.converged |= report.residual <= tolerance && report.worst <= worst;
   return report;

@@ -103,11 +103,17 @@ TYPED_TEST(Solvers, a_column_at_rest_starts_from_its_solution_and_needs_few_roun
 // Sweeps carry a force one layer at a time: thousands for 320 layers. Newton needs a handful, and W of a column factorises in O(n).
 TYPED_TEST(Solvers, a_tall_narrow_column_costs_some_newton_steps_and_no_thousands_of_sweeps) {
   constexpr int dim = TypeParam::value;
-  auto sim = column<dim>(320);
-  sim.settings.solve.tolerance = 1e-8;
-  const auto report = sim.step(1e-3);
-  EXPECT_EQ(report.unconverged, 0);
-  EXPECT_LT(report.sweeps, 400);
+  for (const bool in_a_shaft : {false, true}) {
+    auto sim = column<dim>(320);
+    if (in_a_shaft)  // contacts with walls at all heights
+      for (const double side : {-1.0, 1.0}) sim.add_plane(in_plane<dim>(1e-3 * side, 0), in_plane<dim>(-side, 0), "wall");
+    const auto report = sim.step(1e-3);
+    EXPECT_EQ(report.unconverged, 0);
+    EXPECT_LT(report.sweeps, 400);
+    double weight = 0.0;
+    for (const Body<dim>& b : sim.grains().body) weight += g / b.inv_m;
+    EXPECT_NEAR(-sim.walls()[0].force[1], weight, 0.01 * weight);
+  }
 }
 
 TYPED_TEST(Solvers, overlaps_do_not_add_up_beyond_the_tolerance_in_diameters_however_loose_it_is) {

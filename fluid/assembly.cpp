@@ -1,0 +1,278 @@
+// The system of a step or a steady flow: assembled, put into the form that the solver takes, solved.
+#include "facet.hpp"
+#include "fluid.hpp"
+
+#include "meshes/errors.hpp"
+
+#include <algorithm>
+#include <chrono>
+
+namespace quicksand::fluid {
+
+using meshes::fail;
+
+namespace {
+
+double seconds() { return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count(); }
+
+}  // namespace
+
+template <int dim>
+template <int order>
+ElementInput<dim, order> Fluid<dim>::input(int element) const {
+  ElementInput<dim, order> in;
+  for (int a = 0; a <= dim; ++a) {
+    const int k = mesh_->elements[element][a];
+    in.x[a] = position_[k], in.mesh_velocity[a] = mesh_velocity_[k];
+  }
+  for (int a = 0; a < in.n; ++a) {
+    const int node = space_.node_of[element * in.n + a];
+    for (int t = 0; t < 3; ++t) in.eps[t][a] = eps_[t][node];
+    in.flux[0][a] = Eigen::Map<const Vec<dim>>(&guess_[space_.first_dof[node]]);
+    for (int t = 0; t < 2; ++t) in.flux[t + 1][a] = Eigen::Map<const Vec<dim>>(&x_[t][space_.first_dof[node]]);
+  }
+  if (!reaction_.empty()) in.reaction = &reaction_[element * quadrature<dim, order>().size()];
+  in.advection = settings.advection != Advection::none;
+  return in;
+}
+
+template <int dim>
+template <int order>
+void Fluid<dim>::scatter(int local, const ElementSystem<dim, order>& system) {
+  constexpr int n = shape_count<dim, order>;
+  const int* node = &space_.node_of[space_.elements[local] * n];
+  const int* place = &space_.place[static_cast<std::size_t>(local) * n * n];
+  for (int a = 0; a < n; ++a) {
+    if (!space_.mine(node[a])) continue;
+    const int row = space_.first_dof[node[a]] - space_.begin, from = dof_of<dim>(a), rows = a <= dim ? dim + 1 : dim;
+    for (int i = 0; i < rows; ++i) {
+      b_[row + i] += system.b[from + i];
+      double* in_row = &values_[space_.row_start[row + i]];
+      for (int b = 0; b < n; ++b)
+        for (int j = 0; j < (b <= dim ? dim + 1 : dim); ++j) in_row[place[a * n + b] + j] += system.a(from + i, dof_of<dim>(b) + j);
+    }
+  }
+}
+
+template <int dim>
+template <int order>
+void Fluid<dim>::assemble(const TimeWeights& time, bool newton) {
+  values_.assign(space_.column.size(), 0.0);
+  b_.assign(space_.end - space_.begin, 0.0);
+  ElementSystem<dim, order> system;
+  for (std::size_t local = 0; local < space_.elements.size(); ++local) {
+    ElementInput<dim, order> in = input<order>(space_.elements[local]);
+    in.newton = newton;
+    element_system<dim, order>(in, properties, time, system);
+    scatter<order>(static_cast<int>(local), system);
+  }
+  for (int node = 0; node < space_.nodes(); ++node)
+    if (space_.is_vertex(node) && space_.mine(node))
+      b_[space_.pressure_dof(node) - space_.begin] -= time[0] * eps_change_[node] - time[2] * old_eps_change_[node];
+  add_boundaries<order>();
+}
+
+// Where the pressure is given: eps (p_out - p) n . w, so that the traction is -p_out n; and where fluid enters there,
+// -rho min((U - eps w) . n, 0) (u - u_out) . w: it has the velocity of what is outside, and brings no other energy in. At an outflow
+// -p n + eta grad u n replaces the traction, so that a parallel flow leaves as it is: Heywood, Rannacher and Turek, IJNMF 22 (1996).
+template <int dim>
+template <int order>
+void Fluid<dim>::add_boundaries() {
+  constexpr int n = shape_count<dim, order>;
+  std::vector<int> local_of(mesh_->elements.size(), -1);
+  for (std::size_t local = 0; local < space_.elements.size(); ++local) local_of[space_.elements[local]] = static_cast<int>(local);
+  for (std::size_t k = 0; k < conditions_.size(); ++k) {
+    if (!conditions_[k].pressure) continue;
+    std::size_t q = 0;
+    for (const int f : facets_of_[k]) {
+      const FacetView<dim> facet(*mesh_, position_, f);
+      const int local = local_of[facet.element];
+      if (local < 0) {
+        q += quadrature<dim - 1, 2>().size();
+        continue;
+      }
+      const ElementInput<dim, order> in = input<order>(space_.elements[local]);
+      const Geometry<dim> g = geometry<dim>(in.x);
+      ElementSystem<dim, order> system;
+      system.a.setZero(), system.b.setZero();
+      along<dim>(facet, [&](const Barycentric<dim>& l, double weight) {
+        const auto shape = shapes<dim, order>(l);
+        const auto grad = shape_gradients<dim, order>(l, g.grad_l);
+        const Vec<dim> area = weight * facet.area;
+        double eps = 0.0;
+        Vec<dim> flux = Vec<dim>::Zero(), grad_eps = Vec<dim>::Zero(), mesh_velocity = Vec<dim>::Zero();
+        for (int a = 0; a < n; ++a) eps += shape[a] * in.eps[0][a], flux += shape[a] * in.flux[0][a], grad_eps += in.eps[0][a] * grad[a];
+        for (int a = 0; a <= dim; ++a) mesh_velocity += l[a] * in.mesh_velocity[a];
+        const double enters = in.advection ? properties.density * std::max(-(flux - eps * mesh_velocity).dot(area), 0.0) : 0.0;
+        for (int a = 0; a < n; ++a)
+          for (int i = 0; i < dim; ++i) {
+            const int row = dof_of<dim>(a) + i;
+            system.b[row] += shape[a] * (enters * outer_velocity_[k][q][i] - eps * outer_pressure_[k][q] * area[i]);
+            for (int b = 0; b <= dim; ++b) system.a(row, dof_of<dim>(b) + dim) -= shape[a] * eps * l[b] * area[i];
+            for (int b = 0; b < n; ++b) {
+              system.a(row, dof_of<dim>(b) + i) += enters * shape[a] * shape[b] / eps;
+              if (conditions_[k].kind != Kind::outflow) continue;
+              const double slope = grad[b][i] - shape[b] / eps * grad_eps[i];  // of U/eps, times eps
+              for (int j = 0; j < dim; ++j) system.a(row, dof_of<dim>(b) + j) -= properties.viscosity * shape[a] * slope * area[j];
+            }
+          }
+        ++q;
+      });
+      scatter<order>(local, system);
+    }
+  }
+}
+
+template <int dim>
+std::vector<double> Fluid<dim>::times_matrix(const std::vector<double>& x) const {
+  std::vector<double> y(space_.end - space_.begin, 0.0);
+  for (std::size_t r = 0; r < y.size(); ++r)
+    for (int k = space_.row_start[r]; k < space_.row_start[r + 1]; ++k) y[r] += values_[k] * x[space_.column[k]];
+  return y;
+}
+
+// The unknowns at the end of a step, or of a steady flow. Solved for what is missing to a start that satisfies the conditions, in the
+// frames of the held nodes, and scaled so that pressure and flux weigh the same.
+template <int dim>
+std::vector<double> Fluid<dim>::solve(const char* function, const std::vector<double>& start, const TimeWeights& time, bool newton, double tolerance, Report& report) {
+  const double begun = seconds();
+  velocity_order() == 1 ? assemble<1>(time, newton) : assemble<2>(time, newton);
+  const double assembled = seconds();
+  report.assembly_time += assembled - begun;
+  const int own = space_.end - space_.begin;
+  std::vector<double> x = start;
+  for (int node = 0; node < space_.nodes(); ++node) {
+    const Held& held = held_[node];
+    if (held.last == 0) continue;
+    Eigen::Map<Vec<dim>> flux(&x[space_.first_dof[node]]);
+    Vec<dim> along = held.frame.transpose() * flux;
+    along.head(held.last) = held.value.head(held.last);
+    flux = held.frame * along;
+  }
+  const int pinned = has_pressure_reference() ? -1 : space_.pressure_dof(space_.vertex[mesh_->elements[0][0]]);
+  std::vector<double> missing = times_matrix(x), values = values_;
+  for (int r = 0; r < own; ++r) missing[r] = b_[r] - missing[r];
+  if (pinned >= 0) spread_surplus(function, x, time, missing);
+
+  std::vector<int> node_at(space_.dofs(), -1);  // velocity node whose components begin there
+  for (int node = 0; node < space_.nodes(); ++node) node_at[space_.first_dof[node]] = node;
+  std::array<double, 3> size{};  // of the momentum's diagonal, of what pressures do to it, rows
+  std::vector<char> is_pressure(space_.dofs(), false);
+  for (int node = 0; node < space_.nodes(); ++node)
+    if (space_.is_vertex(node)) is_pressure[space_.pressure_dof(node)] = true;
+  for (int r = 0; r < own; ++r) {
+    if (is_pressure[space_.begin + r]) continue;
+    for (int k = space_.row_start[r]; k < space_.row_start[r + 1]; ++k)
+      if (space_.column[k] == space_.begin + r) size[0] += std::abs(values[k]);
+      else if (is_pressure[space_.column[k]]) size[1] += std::abs(values[k]);
+  }
+  sum_over_ranks(size);
+  const double pressure_scale = pressure_scale_ = size[0] / size[1];
+  for (int node = 0; node < space_.nodes(); ++node) {
+    if (!space_.mine(node)) continue;
+    const int first = space_.first_dof[node] - space_.begin, length = space_.row_start[first + 1] - space_.row_start[first];
+    double* rows = &values[space_.row_start[first]];
+    const int* columns = &space_.column[space_.row_start[first]];
+    if (has_frame_[node]) {
+      Eigen::Map<Eigen::Matrix<double, dim, Eigen::Dynamic, Eigen::RowMajor>> block(rows, dim, length);
+      block = (held_[node].frame.transpose() * block).eval();
+      Eigen::Map<Vec<dim>> m(&missing[first]);
+      m = (held_[node].frame.transpose() * m).eval();
+    }
+    for (int i = 0; i < space_.dofs_at(node); ++i, rows += length) {
+      const int row = space_.begin + first + i;
+      if (i < dim ? i < held_[node].last : row == pinned) {
+        for (int k = 0; k < length; ++k) rows[k] = columns[k] == row ? 1.0 : 0.0;
+        missing[first + i] = 0.0;
+        continue;
+      }
+      for (int k = 0; k < length; ++k) {
+        const int other = node_at[columns[k]];
+        if (other >= 0 && has_frame_[other]) {
+          Eigen::Map<Eigen::Matrix<double, 1, dim>> block(&rows[k]);
+          block = (block * held_[other].frame).eval();
+        }
+        if (is_pressure[columns[k]]) rows[k] *= pressure_scale;
+        if (i == dim) rows[k] *= pressure_scale;
+      }
+      if (i == dim) missing[first + i] *= pressure_scale;
+    }
+  }
+  if (!solver_) {
+    LinearSettings linear = settings.linear.value_or(LinearSettings{.method = dim == 2 ? Method::direct : velocity_order() == 1 ? Method::ilu : Method::fieldsplit});
+    std::vector<int> pressures;
+    for (int k = space_.begin; k < space_.end; ++k)
+      if (is_pressure[k]) pressures.push_back(k);
+    solver_ = std::make_unique<LinearSolver>(space_.begin, space_.end, space_.dofs(), space_.row_start, space_.column, linear, velocity_order() == 1 ? dim + 1 : 1, pressures);
+  }
+  std::vector<double> change(space_.dofs(), 0.0);
+  const LinearReport linear = solver_->solve(values, missing, std::span(change).subspan(space_.begin, own), tolerance);
+  report.linear_iterations += linear.iterations;
+  report.factorisations += linear.factorised;
+  share(change, space_.first_of_rank);
+  const bool finite = std::all_of(change.begin(), change.end(), [](double v) { return std::isfinite(v); });
+  if (!linear.converged || !finite)
+    throw NotConverged(fmt::format("{}: velocity and pressure not found in step {}, t = {:.6g} s: {} after {} iterations, residual {:.1e}. Likely causes: {}", function,
+                                   steps_ + 1, time_, finite || !linear.converged ? linear.reason : "values not finite", linear.iterations, linear.residual,
+                                   "velocities that have blown up (a smaller time step), elements of extreme aspect, parts of the domain without a condition on the pressure"));
+  for (int node = 0; node < space_.nodes(); ++node) {
+    if (has_frame_[node]) {
+      Eigen::Map<Vec<dim>> u(&change[space_.first_dof[node]]);
+      u = (held_[node].frame * u).eval();
+    }
+    if (space_.is_vertex(node)) change[space_.pressure_dof(node)] *= pressure_scale;
+  }
+  for (int k = 0; k < space_.dofs(); ++k) x[k] += change[k];
+  if (pinned >= 0) {
+    const double shift = mean_pressure_.value_or(0.0) - mean_pressure(x);
+    for (int node = 0; node < space_.nodes(); ++node)
+      if (space_.is_vertex(node)) x[space_.pressure_dof(node)] += shift;
+  }
+  const std::vector<double> there = times_matrix(x);
+  reaction_at_nodes_.assign(space_.dofs(), 0.0);
+  for (int r = 0; r < own; ++r) reaction_at_nodes_[space_.begin + r] = there[r] - b_[r];
+  share(reaction_at_nodes_, space_.first_of_rank);
+  report.solve_time += seconds() - assembled;
+  return x;
+}
+
+// Where no fluid can leave, what boundaries and a changing void fraction let in must add up to nothing. Profiles on a mesh do so up to its
+// error, which every vertex takes its share of.
+template <int dim>
+void Fluid<dim>::spread_surplus(const char* function, const std::vector<double>& x, const TimeWeights& time, std::vector<double>& missing) const {
+  Report balance;
+  account(balance, x, time);
+  const double surplus = balance.net_inflow - balance.pore_volume_rate;
+  if (balance.volume_error > 0.01)
+    fail("{}: no boundary lets fluid leave, but {:.6g} flow in and the pores grow by {:.6g} (2D: m^2/s, 3D: m^3/s); set an outflow, or velocities that add up", function,
+                                            balance.net_inflow, balance.pore_volume_rate);
+  double volume = 0.0;
+  std::vector<double> share(space_.nodes(), 0.0);
+  for (const auto& element : mesh_->elements) {
+    std::array<Vec<dim>, dim + 1> corner;
+    for (int a = 0; a <= dim; ++a) corner[a] = position_[element[a]];
+    const double v = geometry<dim>(corner).volume;
+    volume += v;
+    for (const int k : element) share[space_.vertex[k]] += v / (dim + 1);
+  }
+  for (int node = 0; node < space_.nodes(); ++node)
+    if (space_.is_vertex(node) && space_.mine(node)) missing[space_.pressure_dof(node) - space_.begin] -= surplus * share[node] / volume;
+}
+
+template <int dim>
+double Fluid<dim>::mean_pressure(const std::vector<double>& x) const {
+  double sum = 0.0, volume = 0.0;
+  for (const auto& element : mesh_->elements) {
+    std::array<Vec<dim>, dim + 1> corner;
+    double mean = 0.0;
+    for (int a = 0; a <= dim; ++a) corner[a] = position_[element[a]], mean += x[space_.pressure_dof(space_.vertex[element[a]])] / (dim + 1);
+    const double v = geometry<dim>(corner).volume;
+    sum += v * mean, volume += v;
+  }
+  return sum / volume;
+}
+
+template class Fluid<2>;  // of the members defined here
+template class Fluid<3>;
+
+}  // namespace quicksand::fluid

@@ -1,0 +1,42 @@
+// A facet of the mesh seen from the element that it bounds.
+#pragma once
+
+#include "element.hpp"
+
+#include <algorithm>
+
+namespace quicksand::fluid {
+
+// A facet seen from its first element: which of the element's corners are its own, and its area times the normal out of the element.
+template <int dim>
+struct FacetView {
+  int element;
+  std::array<int, dim> corner;
+  Vec<dim> area;  // [m^(dim-1)]
+  FacetView(const Mesh<dim>& mesh, const std::vector<Vec<dim>>& position, int facet) : FacetView(mesh, facet, [&](int node) { return position[node]; }) {}
+  template <class Where>
+  FacetView(const Mesh<dim>& mesh, int facet, Where&& where) : element(mesh.facet_elements[facet][0]) {
+    std::array<Vec<dim>, dim + 1> x;
+    int opposite = 0, k = 0;
+    for (int a = 0; a <= dim; ++a) {
+      const int node = mesh.elements[element][a];
+      x[a] = where(node);
+      const auto& in = mesh.facets[facet];
+      std::find(in.begin(), in.end(), node) == in.end() ? void(opposite = a) : void(corner[k++] = a);
+    }
+    const Geometry<dim> g = geometry<dim>(x);
+    area = -dim * g.volume * g.grad_l[opposite];  // grad L points to the corner and is one over its height
+  }
+};
+
+// Calls use(point in the element, weight) at the quadrature points of a facet.
+template <int dim, class Use>
+void along(const FacetView<dim>& facet, Use&& use) {
+  for (const auto& point : quadrature<dim - 1, 2>()) {
+    Barycentric<dim> l{};
+    for (int k = 0; k < dim; ++k) l[facet.corner[k]] = point.l[k];
+    use(l, point.weight);
+  }
+}
+
+}  // namespace quicksand::fluid

@@ -1,0 +1,171 @@
+// What can be said of a flow: fluxes and forces on boundaries, values at points, errors against a known flow, the balance of volume.
+#include "facet.hpp"
+#include "fluid.hpp"
+#include "locator.hpp"
+
+#include "meshes/errors.hpp"
+
+#include <Eigen/Geometry>
+
+namespace quicksand::fluid {
+
+using meshes::fail;
+using meshes::place;
+
+template <int dim>
+double Fluid<dim>::flux_of(const std::vector<double>& x, int boundary) const {
+  double sum = 0.0;
+  auto add = [&]<int order>(std::integral_constant<int, order>) {
+    for (const int f : facets_of_[boundary]) {
+      const FacetView<dim> facet(*mesh_, position_, f);
+      along<dim>(facet, [&](const Barycentric<dim>& l, double weight) {
+        const auto shape = shapes<dim, order>(l);
+        for (int a = 0; a < shape_count<dim, order>; ++a)
+          sum += weight * shape[a] * facet.area.dot(Eigen::Map<const Vec<dim>>(&x[space_.first_dof[space_.node_of[facet.element * space_.per_element + a]]]));
+      });
+    }
+  };
+  velocity_order() == 1 ? add(std::integral_constant<int, 1>{}) : add(std::integral_constant<int, 2>{});
+  return sum;
+}
+
+template <int dim>
+double Fluid<dim>::flux(const std::string& boundary) const {
+  const int k = boundary_index("flux", boundary);
+  return flux_of(x_[0], k) - (time_weights_[0] * old_swept_[k] - time_weights_[2] * old_swept_used_[k]);
+}
+
+template <int dim>
+void Fluid<dim>::account(Report& report, const std::vector<double>& x, const TimeWeights& time) const {
+  double area = 0.0, fastest = 0.0, pores = 0.0;
+  for (std::size_t k = 0; k < conditions_.size(); ++k) {
+    if (conditions_[k].kind == Kind::none) continue;  // inside, or on a periodic side
+    report.net_inflow -= flux_of(x, static_cast<int>(k)) - (time[0] * swept_[k] - time[2] * old_swept_[k]);
+    for (const int f : facets_of_[k]) area += FacetView<dim>(*mesh_, position_, f).area.norm();
+  }
+  for (int node = 0; node < space_.nodes(); ++node) {
+    fastest = std::max(fastest, Eigen::Map<const Vec<dim>>(&x[space_.first_dof[node]]).norm());
+    if (space_.is_vertex(node)) pores += std::abs(time[0] * eps_change_[node] - time[2] * old_eps_change_[node]);
+  }
+  // The weights add up to 0 but for rounding: from differences, pores that do not change have no rate however short the step.
+  report.pore_volume_rate = time[0] * (pore_volume_[0] - pore_volume_[1]) - time[2] * (pore_volume_[1] - pore_volume_[2]);
+  // What rounding leaves of a fluid at rest is no error.
+  const double size = fastest * area + pores + 1e-12 * std::abs(time[0] * pore_volume_[0]);
+  report.volume_error = size > 0 ? std::abs(report.pore_volume_rate - report.net_inflow) / size : 0.0;
+}
+
+// Calls use(point, force): what the fluid does to a boundary, the pressure at the facets' quadrature points, the viscous traction at nodes.
+// Where boundaries meet, each has its share of a node, by area.
+template <int dim>
+template <class Use>
+void Fluid<dim>::loads(const char* function, const std::string& boundary, Use&& use) const {
+  const int k = boundary_index(function, boundary);
+  if (reaction_at_nodes_.empty()) throw std::logic_error(fmt::format("{}: nothing is known before the first step", function));
+  std::vector<double> area(space_.nodes(), 0.0);  // of facets at each node
+  for (std::size_t f = 0; f < mesh_->facets.size(); ++f) {
+    if (mesh_->facet_elements[f][1] >= 0) continue;
+    const double own = FacetView<dim>(*mesh_, position_, static_cast<int>(f)).area.norm();
+    for (const auto& [node, x] : facet_nodes(static_cast<int>(f))) area[node] += own;
+  }
+  for (const int f : facets_of_[k]) {
+    const FacetView<dim> facet(*mesh_, position_, f);
+    if (mesh_->facet_elements[f][1] < 0)
+      for (const auto& [node, x] : facet_nodes(f))
+        use(x, Vec<dim>(-facet.area.norm() / area[node] / eps_[1][node] * Eigen::Map<const Vec<dim>>(&reaction_at_nodes_[space_.first_dof[node]])));
+    const auto& corners = mesh_->elements[facet.element];
+    along<dim>(facet, [&](const Barycentric<dim>& l, double weight) {
+      Vec<dim> x = Vec<dim>::Zero();
+      double p = 0.0;
+      for (int a = 0; a <= dim; ++a) x += l[a] * position_[corners[a]], p += l[a] * x_[0][space_.pressure_dof(space_.vertex[corners[a]])];
+      use(x, Vec<dim>(weight * p * facet.area));
+    });
+  }
+}
+
+template <int dim>
+Vec<dim> Fluid<dim>::force(const std::string& boundary) const {
+  Vec<dim> sum = Vec<dim>::Zero();
+  loads("force", boundary, [&](const Vec<dim>&, const Vec<dim>& force) { sum += force; });
+  return sum;
+}
+
+template <int dim>
+auto Fluid<dim>::torque(const std::string& boundary, const Vec<dim>& centre) const -> Moment {
+  Moment sum = Moment::Zero();
+  loads("torque", boundary, [&](const Vec<dim>& x, const Vec<dim>& force) {
+    const Vec<dim> arm = x - centre;
+    if constexpr (dim == 2) sum[0] += arm[0] * force[1] - arm[1] * force[0];
+    else sum += arm.cross(force);
+  });
+  return sum;
+}
+
+template <int dim>
+auto Fluid<dim>::error(const VectorField<dim>& velocity, const ScalarField<dim>& pressure) const -> Error {
+  std::vector<Vec<dim>> x, u;
+  std::vector<double> p, weight;
+  for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
+    const auto& corners = mesh_->elements[e];
+    std::array<Vec<dim>, dim + 1> corner;
+    for (int a = 0; a <= dim; ++a) corner[a] = position_[corners[a]];
+    const double volume = geometry<dim>(corner).volume;
+    for (const auto& point : quadrature<dim, 2>()) {
+      Vec<dim> where = Vec<dim>::Zero();
+      double value = 0.0;
+      for (int a = 0; a <= dim; ++a) where += point.l[a] * corner[a], value += point.l[a] * x_[0][space_.pressure_dof(space_.vertex[corners[a]])];
+      x.push_back(where), p.push_back(value), weight.push_back(point.weight * volume);
+      u.push_back(velocity_in(static_cast<int>(e), point.l));
+    }
+  }
+  const auto exact_u = velocity(x, time_);
+  const auto exact_p = pressure(x, time_);
+  std::array<double, 2> off{}, size{};
+  for (std::size_t k = 0; k < x.size(); ++k) {
+    off[0] += weight[k] * (u[k] - exact_u[k]).squaredNorm(), size[0] += weight[k] * exact_u[k].squaredNorm();
+    off[1] += weight[k] * (p[k] - exact_p[k]) * (p[k] - exact_p[k]), size[1] += weight[k] * exact_p[k] * exact_p[k];
+  }
+  return {std::sqrt(off[0] / size[0]), std::sqrt(off[1] / size[1])};
+}
+
+template <int dim>
+Vec<dim> Fluid<dim>::velocity_in(int element, const Barycentric<dim>& l) const {
+  double eps = 0.0;
+  Vec<dim> flux = Vec<dim>::Zero();
+  auto add = [&](const auto& shape) {
+    for (int a = 0; a < space_.per_element; ++a) {
+      const int node = space_.node_of[element * space_.per_element + a];
+      eps += shape[a] * eps_[1][node];
+      flux += shape[a] * Eigen::Map<const Vec<dim>>(&x_[0][space_.first_dof[node]]);
+    }
+  };
+  velocity_order() == 1 ? add(shapes<dim, 1>(l)) : add(shapes<dim, 2>(l));
+  return flux / eps;
+}
+
+template <int dim>
+auto Fluid<dim>::probe(std::span<const Vec<dim>> x) const -> std::vector<Probe> {
+  const Locator<dim> locator(*mesh_, position_);
+  std::vector<Probe> found;
+  for (const Vec<dim>& point : x) {
+    const auto where = point.allFinite() ? locator.find(point) : std::nullopt;
+    if (!where) fail("probe: {} m (point {}) is not inside the mesh", place(point), found.size());
+    const auto& [element, l] = *where;
+    const auto& corners = mesh_->elements[element];
+    Probe probe{Vec<dim>::Zero(), 0.0, Vec<dim>::Zero()};
+    std::array<Vec<dim>, dim + 1> corner;
+    for (int a = 0; a <= dim; ++a) corner[a] = position_[corners[a]];
+    const Geometry<dim> g = geometry<dim>(corner);
+    for (int a = 0; a <= dim; ++a) {
+      const double p = x_[0][space_.pressure_dof(space_.vertex[corners[a]])];
+      probe.pressure += l[a] * p, probe.pressure_gradient += p * g.grad_l[a];
+    }
+    probe.velocity = velocity_in(element, l);
+    found.push_back(probe);
+  }
+  return found;
+}
+
+template class Fluid<2>;  // of the members defined here
+template class Fluid<3>;
+
+}  // namespace quicksand::fluid
