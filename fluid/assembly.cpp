@@ -32,8 +32,28 @@ ElementInput<dim, order> Fluid<dim>::input(int element) const {
     for (int t = 0; t < 2; ++t) in.flux[t + 1][a] = Eigen::Map<const Vec<dim>>(&x_[t][space_.first_dof[node]]);
   }
   if (!reaction_.empty()) in.reaction = &reaction_[element * quadrature<dim, order>().size()];
+  if constexpr (order == 1)
+    for (int t = 0; t < 2; ++t) in.subscale[t] = &subscale_[t][element * quadrature<dim, 1>().size()];
   in.advection = settings.advection != Advection::none;
   return in;
+}
+
+// Of the flow x, at the quadrature points of all elements.
+template <int dim>
+std::vector<Vec<dim>> Fluid<dim>::subscales(const std::vector<double>& x, const TimeWeights& time) const {
+  if (velocity_order() != 1) return {};
+  std::vector<Vec<dim>> all(subscale_[0].size());
+  for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
+    const ElementInput<dim, 1> in = input<1>(static_cast<int>(e));
+    std::array<Vec<dim>, dim + 1> flux;
+    std::array<double, dim + 1> p;
+    for (int a = 0; a <= dim; ++a) {
+      const int node = space_.node_of[e * (dim + 1) + a];
+      flux[a] = Eigen::Map<const Vec<dim>>(&x[space_.first_dof[node]]), p[a] = x[space_.pressure_dof(node)];
+    }
+    element_subscale<dim>(in, properties, time, flux, p, &all[e * quadrature<dim, 1>().size()]);
+  }
+  return all;
 }
 
 template <int dim>

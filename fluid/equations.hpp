@@ -40,6 +40,7 @@ struct ElementInput {
   std::array<std::array<Vec<dim>, n>, 3> flux;     // U: [0] the guess that advects, then the past [m/s]
   std::array<Vec<dim>, dim + 1> mesh_velocity;     // [m/s]
   const Reaction<dim>* reaction = nullptr;         // at each quadrature point, or none
+  std::array<const Vec<dim>*, 2> subscale{};       // order 1: one and two steps ago, at each quadrature point [m/s]; none: 0
   bool advection = true;
   bool newton = false;                             // derivative of the advection as well; otherwise by the guess alone
 };
@@ -59,9 +60,13 @@ struct ElementSystem {
   Eigen::Matrix<double, dofs, 1> b;
 };
 
-// How much of the residual the finer scales make of velocity [m^3 s/kg], after Shakib, Hughes and Johan, CMAME 89 (1991), with the metric
-// of the element, so that stretched elements are judged by the direction of the flow; and the bulk viscosity [Pa s] that goes with it.
-// The bulk viscosity knows neither the time step nor beta: with them, it would lock the flow as they grow.
+// The finer scales' own velocity U' [m/s], of which linear elements know nothing but this, at each quadrature point:
+//   rho dU'/dt + U'/tau = -(residual of the momentum),   U + U' is what continuity holds for.
+// It lives on from step to step, after R. Codina, J. Principe, O. Guasch and S. Badia, CMAME 196 (2007). Were it made anew in every step, with the
+// time step in tau, another time step would be another divergence of U, and cost a pressure of rho tau/dt times the residual.
+// 1/tau without time after Shakib, Hughes and Johan, CMAME 89 (1991), with the metric of the element, so that stretched elements are judged by the
+// direction of the flow; `tau` below [m^3 s/kg] is 1/(rho a[0] + 1/tau). And the bulk viscosity [Pa s] that goes with it: it knows neither the time
+// step nor beta: with them, it would lock the flow as they grow.
 template <int dim>
 struct Stabilisation {
   double tau, bulk;
@@ -72,9 +77,17 @@ Stabilisation<dim> stabilisation(const Geometry<dim>& g, const Properties<dim>& 
   for (const Vec<dim>& grad : g.grad_l) metric += 2.0 * grad * grad.transpose();
   const double advective = fluid.density * fluid.density * u.dot(metric * u);
   const double viscous = 9.0 * fluid.viscosity * fluid.viscosity * metric.squaredNorm();
-  const double inertia = 2.0 * fluid.density * rate;
   const double steady = advective + viscous;
-  return {1.0 / std::sqrt(inertia * inertia + steady + beta_over_eps * beta_over_eps), std::sqrt(steady) / metric.trace()};
+  return {1.0 / (fluid.density * rate + std::sqrt(steady + beta_over_eps * beta_over_eps)), std::sqrt(steady) / metric.trace()};
+}
+
+// rho (a[1] U' + a[2] U'') of past subscales at quadrature point q [N/m^3].
+template <int dim, int order>
+Vec<dim> memory(const ElementInput<dim, order>& in, const Properties<dim>& fluid, const TimeWeights& time, int q) {
+  Vec<dim> sum = Vec<dim>::Zero();
+  for (int t = 0; t < 2; ++t)
+    if (in.subscale[t]) sum += fluid.density * time[t + 1] * in.subscale[t][q];
+  return sum;
 }
 
 template <int dim, int order>
@@ -98,6 +111,7 @@ void element_system(const ElementInput<dim, order>& in, const Properties<dim>& f
     for (int a = 0; a < n; ++a) grad_eps += in.eps[0][a] * grad[a];
     for (int a = 0; a <= dim; ++a) mesh_velocity += point.l[a] * in.mesh_velocity[a];
     const Reaction<dim> reaction = in.reaction ? in.reaction[q] : Reaction<dim>{};
+    const Vec<dim> past_subscale = memory<dim, order>(in, fluid, time, q);
     ++q;
     const double inv_eps = 1.0 / eps[0];
     const Vec<dim> u = flux[0] * inv_eps, relative = in.advection ? Vec<dim>(u - mesh_velocity) : Vec<dim>::Zero();
@@ -163,9 +177,45 @@ void element_system(const ElementInput<dim, order>& in, const Properties<dim>& f
           out.a.template block<1, dim>(row + dim, column) += test.transpose() * strong[b];
           out.a(row + dim, column + dim) += eps[0] * test.dot(grad[b]);
         }
-        out.b[row + dim] += test.dot(load);
+        for (int i = 0; i < dim; ++i) out.b[row + i] -= along * past_subscale[i];
+        out.b[row + dim] += test.dot(load - past_subscale);
       }
     }
+  }
+}
+
+// The subscale U' at each quadrature point, where U and p are found: rho dU'/dt + U'/tau = -(residual of the momentum).
+// R. Codina, J. Principe, O. Guasch and S. Badia, CMAME 196 (2007).
+template <int dim>
+void element_subscale(const ElementInput<dim, 1>& in, const Properties<dim>& fluid, const TimeWeights& time, const std::array<Vec<dim>, dim + 1>& found, const std::array<double, dim + 1>& p, Vec<dim>* out) {
+  constexpr int n = dim + 1;
+  const Geometry<dim> g = geometry<dim>(in.x);
+  const double rho = fluid.density, eta = fluid.viscosity;
+  const auto& grad = g.grad_l;
+  int q = 0;
+  for (const auto& point : quadrature<dim, 1>()) {
+    std::array<double, 3> eps{};
+    std::array<Vec<dim>, 3> flux;
+    Vec<dim> grad_eps = Vec<dim>::Zero(), mesh_velocity = Vec<dim>::Zero(), now = Vec<dim>::Zero(), grad_p = Vec<dim>::Zero();
+    for (int t = 0; t < 3; ++t) {
+      flux[t].setZero();
+      for (int a = 0; a < n; ++a) eps[t] += point.l[a] * in.eps[t][a], flux[t] += point.l[a] * in.flux[t][a];
+    }
+    for (int a = 0; a < n; ++a) grad_eps += in.eps[0][a] * grad[a], mesh_velocity += point.l[a] * in.mesh_velocity[a], now += point.l[a] * found[a], grad_p += p[a] * grad[a];
+    const double inv_eps = 1.0 / eps[0];
+    const Reaction<dim> reaction = in.reaction ? in.reaction[q] : Reaction<dim>{};
+    const Vec<dim> relative = in.advection ? Vec<dim>(flux[0] * inv_eps - mesh_velocity) : Vec<dim>::Zero();
+    Vec<dim> residual = eps[0] * grad_p + rho * time[0] * now + reaction.beta * inv_eps * now - reaction.beta_target - reaction.force -
+                        eps[0] * rho * (fluid.gravity - time[1] / eps[1] * flux[1] - time[2] / eps[2] * flux[2]);
+    for (int b = 0; b < n; ++b) {
+      const Vec<dim> grad_u = (grad[b] - point.l[b] * inv_eps * grad_eps) * inv_eps;
+      const Mat<dim> cross = grad[b] * grad_eps.transpose();
+      const Mat<dim> hessian = (2.0 * point.l[b] * inv_eps * grad_eps * grad_eps.transpose() - cross - cross.transpose()) * (inv_eps * inv_eps);
+      residual += rho * eps[0] * relative.dot(grad_u) * found[b] - eps[0] * eta * (hessian * found[b] + hessian.trace() * found[b]);
+    }
+    const double tau = stabilisation<dim>(g, fluid, relative, time[0], reaction.beta * inv_eps).tau;
+    out[q] = -tau * (residual + memory<dim, 1>(in, fluid, time, q));
+    ++q;
   }
 }
 

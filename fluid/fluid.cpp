@@ -31,6 +31,7 @@ Fluid<dim>::Fluid(std::shared_ptr<const Mesh<dim>> mesh, int order, Properties<d
   eps_.fill(std::vector<double>(space_.nodes(), 1.0));
   x_.fill(std::vector<double>(space_.dofs(), 0.0));
   guess_ = x_[0];
+  if (order == 1) subscale_.fill(std::vector<Vec<dim>>(mesh_->elements.size() * quadrature<dim, 1>().size(), Vec<dim>::Zero()));
   eps_change_.assign(space_.nodes(), 0.0);
   old_eps_change_ = eps_change_;
   held_.resize(space_.nodes());
@@ -114,6 +115,7 @@ void Fluid<dim>::set_velocity(std::span<const Vec<dim>> u) {
     flux = eps_[1][number[k]] * u[k];
   }
   x_[1] = x_[0], steps_ = 0;
+  for (auto& subscale : subscale_) std::fill(subscale.begin(), subscale.end(), Vec<dim>::Zero());
 }
 
 template <int dim>
@@ -194,6 +196,8 @@ Report Fluid<dim>::step(double dt) {
     position_ = old_position_, mesh_velocity_ = mesh_velocity;
     throw;
   }
+  std::vector<Vec<dim>> subscale = subscales(x, time);
+  subscale_[1].swap(subscale_[0]), subscale_[0].swap(subscale);
   x_[1].swap(x_[0]), x_[0].swap(x);
   eps_[2] = eps_[1], eps_[1] = eps_[0];
   pore_volume_[2] = pore_volume_[1], pore_volume_[1] = pore_volume_[0];
@@ -230,7 +234,8 @@ void Fluid<dim>::each_part(Visit&& visit) {
   for (auto* many : {&x_[0], &x_[1], &eps_[0], &eps_[1], &eps_[2], &eps_change_, &old_eps_change_, &swept_, &old_swept_, &old_swept_used_}) visit(std::span(*many));
   visit(std::span(pore_volume_));
   visit(std::span(time_weights_));
-  for (auto* points : {&position_, &mesh_velocity_}) visit(std::span(points->data()->data(), dim * points->size()));
+  for (auto* points : {&position_, &mesh_velocity_, &subscale_[0], &subscale_[1]})
+    if (!points->empty()) visit(std::span(points->data()->data(), dim * points->size()));
 }
 
 // What a state must agree with: 53 bits of FNV-1a over the element, the mesh's nodes and how they are connected.
@@ -303,6 +308,7 @@ Report Fluid<dim>::solve_steady() {
     if (k == settings.max_newton) throw_newton("solve_steady", report);
   }
   account(report, x, time);
+  subscale_[1] = subscale_[0] = subscales(x, time);
   x_[1] = x_[0] = x;
   time_weights_ = time;
   steps_ = 0;

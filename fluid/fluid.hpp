@@ -150,6 +150,7 @@ class Fluid {
   void evaluate_outside(double t);
   template <int order>
   ElementInput<dim, order> input(int element) const;
+  std::vector<Vec<dim>> subscales(const std::vector<double>& x, const TimeWeights& time) const;
   template <int order>
   void scatter(int local, const ElementSystem<dim, order>& system);
   template <int order>
@@ -183,6 +184,7 @@ class Fluid {
   std::vector<Vec<dim>> mesh_velocity_;            // of mesh nodes
   std::array<std::vector<double>, 3> eps_;         // at velocity nodes: now, one and two steps ago
   std::array<std::vector<double>, 2> x_;           // unknowns, Cartesian, after the last step and the one before
+  std::array<std::vector<Vec<dim>>, 2> subscale_;  // order 1: at quadrature points, after the last step and the one before [m/s]
   std::vector<double> guess_;                      // that advects
   std::array<double, 3> pore_volume_{};            // int eps: now, and one and two steps ago [m^dim]
   std::vector<double> swept_, old_swept_, old_swept_used_;  // by each boundary over a step: int eps w . n [m^dim]
