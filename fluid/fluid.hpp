@@ -85,8 +85,8 @@ class Fluid {
   Report solve_steady();
 
   // All that changes from step to step; conditions, fields and settings do not belong to it. The step after state() factorises anew, so that
-  // a run that goes on and one that is restored there, on as many ranks, stay the same bit for bit. restore() throws std::invalid_argument
-  // where the state is of another mesh or element.
+  // a run that goes on and one that is restored there, on as many ranks, stay the same bit for bit; on several ranks not with MUMPS, which adds
+  // up messages as they come. restore() throws std::invalid_argument where the state is of another mesh or element.
   std::vector<double> state();
   void restore(std::span<const double> state);
 

@@ -183,11 +183,13 @@ LinearReport LinearSolver::solve(std::span<const double> values, std::span<const
   std::copy(b.begin(), b.end(), to);
   PETSC(VecRestoreArray(s_->b, &to));
   PETSC(KSPSetOperators(s_->ksp, s_->matrix, s_->matrix));
-  const int most = tolerance > s_->settings.tolerance ? s_->settings.most_with_old_factors / 2 : s_->settings.most_with_old_factors;  // Newton's matrices change more
+  // Newton's matrices change more from one to the next; and what it goes on to correct may be far below what it began with.
+  const bool newton = tolerance > s_->settings.tolerance;
+  const int most = newton ? s_->settings.most_with_old_factors / 2 : s_->settings.most_with_old_factors;
   for (bool old = s_->keep_factors;; old = false) {
     PETSC(KSPSetReusePreconditioner(s_->ksp, old ? PETSC_TRUE : PETSC_FALSE));
     // With old factors no more than it costs to make new ones is tried.
-    PETSC(KSPSetTolerances(s_->ksp, std::max(tolerance, s_->settings.tolerance), std::max(s_->settings.tolerance * s_->scale, 1e-300), PETSC_DEFAULT, old ? 2 * most : s_->settings.max_iterations));
+    PETSC(KSPSetTolerances(s_->ksp, std::max(tolerance, s_->settings.tolerance), std::max((newton ? 1e-3 : 1.0) * s_->settings.tolerance * s_->scale, 1e-300), PETSC_DEFAULT, old ? 2 * most : s_->settings.max_iterations));
     const PetscErrorCode error = KSPSolve(s_->ksp, s_->b, s_->x);
     KSPConvergedReason reason = KSP_DIVERGED_PC_FAILED;
     PetscInt iterations = 0;

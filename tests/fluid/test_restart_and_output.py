@@ -112,7 +112,9 @@ for element in ("p1p1", "p2p1"):
         flow.restore(saved)
         for _ in range(2):
             flow.step(0.1)
-        assert np.array_equal(after, flow.velocity)
+        # MUMPS adds up what its processes send as it comes; everything else is the same each time.
+        exact = fluid.ranks() == 1 or dim == 3
+        assert np.array_equal(after, flow.velocity) if exact else np.abs(after - flow.velocity).max() < 1e-8 * np.abs(after).max()
         numbers += [*flow.velocity.ravel(), *flow.pressure, *flow.force("top"), flow.flux("top")]
 if fluid.rank() == 0:
     np.save(sys.argv[1], numbers)
