@@ -30,7 +30,7 @@ def test_newton_needs_as_many_iterations_for_40_layers_as_for_10_and_the_estimat
     last = {}
     for name, solver, tolerance, residual, error, converged in states:
         assert converged and residual <= tolerance
-        assert error < last.get((name, solver), 1.0)
+        assert error < last.get((name, solver), 2.0)  # of what contacts change: more than all of it where sweeps have hardly begun
         last[name, solver] = error
     assert len(last) == 10 and max(last.values()) < 0.2
     runs = dict(zip(results["run_names"], zip(results["run_mu"], results["run_overlap"])))
