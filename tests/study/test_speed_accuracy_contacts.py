@@ -32,7 +32,7 @@ def test_newton_needs_as_many_iterations_for_40_layers_as_for_10_and_the_estimat
         assert converged and residual <= tolerance
         assert error < last.get((name, solver), 2.0)  # of what contacts change: more than all of it where sweeps have hardly begun
         last[name, solver] = error
-    assert len(last) == 10 and max(last.values()) < 0.2
+    assert len(last) == 10 and max(last.values()) < 0.4  # of the quasi-static one, at a residual of 1e-3
     runs = dict(zip(results["run_names"], zip(results["run_mu"], results["run_overlap"])))
     assert runs["reference"][1] < 0.2 * runs["default"][1] and abs(runs["default"][0] - runs["reference"][0]) < 0.15
     assert 0.2 < results["sphere_mu"][0] < 0.6 and 0.55 < results["sphere_phi"][0] < 0.64
