@@ -6,6 +6,7 @@
 
 #include <algorithm>
 #include <chrono>
+#include <numeric>
 
 namespace quicksand::fluid {
 
@@ -88,7 +89,7 @@ void Fluid<dim>::assemble(const TimeWeights& time, bool newton) {
   }
   for (int node = 0; node < space_.nodes(); ++node)
     if (space_.is_vertex(node) && space_.mine(node))
-      b_[space_.pressure_dof(node) - space_.begin] -= time[0] * eps_change_[node] - time[2] * old_eps_change_[node];
+      b_[space_.pressure_dof(node) - space_.begin] -= rate(time, eps_change_[0][node], eps_change_[1][node]);
   add_boundaries<order>();
 }
 
@@ -99,25 +100,22 @@ template <int dim>
 template <int order>
 void Fluid<dim>::add_boundaries() {
   constexpr int n = shape_count<dim, order>;
-  std::vector<int> local_of(mesh_->elements.size(), -1);
-  for (std::size_t local = 0; local < space_.elements.size(); ++local) local_of[space_.elements[local]] = static_cast<int>(local);
   for (std::size_t k = 0; k < conditions_.size(); ++k) {
     if (!conditions_[k].pressure) continue;
     std::size_t q = 0;
     for (const int f : facets_of_[k]) {
       const FacetView<dim> facet(*mesh_, position_, f);
-      const int local = local_of[facet.element];
+      const int local = space_.local_of[facet.element];
       if (local < 0) {
         q += quadrature<dim - 1, 2>().size();
         continue;
       }
       const ElementInput<dim, order> in = input<order>(space_.elements[local]);
-      const Geometry<dim> g = geometry<dim>(in.x);
       ElementSystem<dim, order> system;
       system.a.setZero(), system.b.setZero();
       along<dim>(facet, [&](const Barycentric<dim>& l, double weight) {
         const auto shape = shapes<dim, order>(l);
-        const auto grad = shape_gradients<dim, order>(l, g.grad_l);
+        const auto grad = shape_gradients<dim, order>(l, facet.geometry.grad_l);
         const Vec<dim> area = weight * facet.area;
         double eps = 0.0;
         Vec<dim> flux = Vec<dim>::Zero(), grad_eps = Vec<dim>::Zero(), mesh_velocity = Vec<dim>::Zero();
@@ -156,7 +154,7 @@ std::vector<double> Fluid<dim>::times_matrix(const std::vector<double>& x) const
 template <int dim>
 std::vector<double> Fluid<dim>::solve(const char* function, const std::vector<double>& start, const TimeWeights& time, bool newton, double tolerance, Report& report) {
   const double begun = seconds();
-  velocity_order() == 1 ? assemble<1>(time, newton) : assemble<2>(time, newton);
+  with_order(velocity_order(), [&]<int order>(std::integral_constant<int, order>) { assemble<order>(time, newton); });
   const double assembled = seconds();
   report.assembly_time += assembled - begun;
   const int own = space_.end - space_.begin;
@@ -174,12 +172,8 @@ std::vector<double> Fluid<dim>::solve(const char* function, const std::vector<do
   for (int r = 0; r < own; ++r) missing[r] = b_[r] - missing[r];
   if (pinned >= 0) spread_surplus(function, x, time, missing);
 
-  std::vector<int> node_at(space_.dofs(), -1);  // velocity node whose components begin there
-  for (int node = 0; node < space_.nodes(); ++node) node_at[space_.first_dof[node]] = node;
-  std::array<double, 3> size{};  // of the momentum's diagonal, of what pressures do to it, rows
-  std::vector<char> is_pressure(space_.dofs(), false);
-  for (int node = 0; node < space_.nodes(); ++node)
-    if (space_.is_vertex(node)) is_pressure[space_.pressure_dof(node)] = true;
+  const auto& is_pressure = space_.is_pressure;
+  std::array<double, 2> size{};  // of the momentum's diagonal, and of what pressures do to it
   for (int r = 0; r < own; ++r) {
     if (is_pressure[space_.begin + r]) continue;
     for (int k = space_.row_start[r]; k < space_.row_start[r + 1]; ++k)
@@ -207,7 +201,7 @@ std::vector<double> Fluid<dim>::solve(const char* function, const std::vector<do
         continue;
       }
       for (int k = 0; k < length; ++k) {
-        const int other = node_at[columns[k]];
+        const int other = space_.node_at[columns[k]];
         if (other >= 0 && has_frame_[other]) {
           Eigen::Map<Eigen::Matrix<double, 1, dim>> block(&rows[k]);
           block = (block * held_[other].frame).eval();
@@ -265,31 +259,31 @@ void Fluid<dim>::spread_surplus(const char* function, const std::vector<double>&
   const double surplus = balance.net_inflow - balance.pore_volume_rate;
   if (balance.volume_error > 0.01)
     fail("{}: no boundary lets fluid leave, but {:.6g} flow in and the pores grow by {:.6g} (2D: m^2/s, 3D: m^3/s); set an outflow, or velocities that add up", function,
-                                            balance.net_inflow, balance.pore_volume_rate);
-  double volume = 0.0;
-  std::vector<double> share(space_.nodes(), 0.0);
-  for (const auto& element : mesh_->elements) {
-    std::array<Vec<dim>, dim + 1> corner;
-    for (int a = 0; a <= dim; ++a) corner[a] = position_[element[a]];
-    const double v = geometry<dim>(corner).volume;
-    volume += v;
-    for (const int k : element) share[space_.vertex[k]] += v / (dim + 1);
-  }
+         balance.net_inflow, balance.pore_volume_rate);
+  const std::vector<double> share = vertex_volumes();
+  const double volume = std::accumulate(share.begin(), share.end(), 0.0);
   for (int node = 0; node < space_.nodes(); ++node)
     if (space_.is_vertex(node) && space_.mine(node)) missing[space_.pressure_dof(node) - space_.begin] -= surplus * share[node] / volume;
 }
 
+// int q over the mesh for each q of a vertex [m^dim].
+template <int dim>
+std::vector<double> Fluid<dim>::vertex_volumes() const {
+  std::vector<double> volumes(space_.nodes(), 0.0);
+  for (const auto& element : mesh_->elements) {
+    const double share = geometry<dim>(position_, element).volume / (dim + 1);
+    for (const int k : element) volumes[space_.vertex[k]] += share;
+  }
+  return volumes;
+}
+
 template <int dim>
 double Fluid<dim>::mean_pressure(const std::vector<double>& x) const {
-  double sum = 0.0, volume = 0.0;
-  for (const auto& element : mesh_->elements) {
-    std::array<Vec<dim>, dim + 1> corner;
-    double mean = 0.0;
-    for (int a = 0; a <= dim; ++a) corner[a] = position_[element[a]], mean += x[space_.pressure_dof(space_.vertex[element[a]])] / (dim + 1);
-    const double v = geometry<dim>(corner).volume;
-    sum += v * mean, volume += v;
-  }
-  return sum / volume;
+  const std::vector<double> volumes = vertex_volumes();
+  double sum = 0.0;
+  for (int node = 0; node < space_.nodes(); ++node)
+    if (space_.is_vertex(node)) sum += volumes[node] * x[space_.pressure_dof(node)];
+  return sum / std::accumulate(volumes.begin(), volumes.end(), 0.0);
 }
 
 template class Fluid<2>;  // of the members defined here

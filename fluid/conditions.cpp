@@ -19,11 +19,17 @@ int Fluid<dim>::boundary_index(const char* function, const std::string& name) co
 }
 
 template <int dim>
-auto Fluid<dim>::condition(const char* function, const std::string& name, Kind kind) -> Condition& {
+int Fluid<dim>::outer_boundary(const char* function, const std::string& name) const {
   const int k = boundary_index(function, name);
   for (const int f : facets_of_[k])
     if (mesh_->facet_elements[f][1] >= 0)
       fail("{}: \"{}\" has facets inside the domain or on a periodic side: they can be measured, but hold nothing", function, name);
+  return k;
+}
+
+template <int dim>
+auto Fluid<dim>::condition(const char* function, const std::string& name, Kind kind) -> Condition& {
+  const int k = outer_boundary(function, name);
   if (mean_pressure_ && (kind == Kind::outflow || kind == Kind::permeable))
     fail("{}: the mean pressure is set already, \"{}\" would be a second reference", function, name);
   conditions_[k] = {};
@@ -56,14 +62,14 @@ void Fluid<dim>::set_permeable(const std::string& boundary, VectorField<dim> vel
 
 template <int dim>
 bool Fluid<dim>::has_pressure_reference() const {
-  return std::any_of(conditions_.begin(), conditions_.end(), [](const Condition& c) { return c.kind == Kind::outflow || c.kind == Kind::permeable; });
+  return std::any_of(conditions_.begin(), conditions_.end(), [](const Condition& c) { return static_cast<bool>(c.pressure); });
 }
 
 template <int dim>
 void Fluid<dim>::set_mean_pressure(double pressure) {
   if (!std::isfinite(pressure)) fail("set_mean_pressure: must be finite, got {} Pa", pressure);
   for (std::size_t k = 0; k < conditions_.size(); ++k)
-    if (conditions_[k].kind == Kind::outflow || conditions_[k].kind == Kind::permeable)
+    if (conditions_[k].pressure)
       fail("set_mean_pressure: boundary \"{}\" sets the pressure already, there can be one reference only", mesh_->boundary_names[k]);
   mean_pressure_ = pressure;
 }
@@ -83,13 +89,13 @@ void Fluid<dim>::check_conditions(const char* function) const {
 // What holds each velocity node at time t, on the mesh as it is now.
 template <int dim>
 void Fluid<dim>::hold(double t) {
-  struct Held1 {  // one boundary's say on a node
+  struct Say {  // of one boundary on a node
     Kind kind;
     int turn;
     Vec<dim> value;
     std::vector<Vec<dim>> normals;
   };
-  std::vector<std::vector<Held1>> says(space_.nodes());
+  std::vector<std::vector<Say>> says(space_.nodes());
   for (std::size_t k = 0; k < conditions_.size(); ++k) {
     const Condition& c = conditions_[k];
     if (c.kind == Kind::none || c.kind == Kind::outflow) continue;
@@ -133,9 +139,9 @@ void Fluid<dim>::hold(double t) {
       held.value[held.last++] = eps * velocity.dot(rest);
     };
     // Walls and inflows hold everything. Where several meet, each says what crosses it, so that none leaks, and the last one set the rest.
-    std::sort(says[node].begin(), says[node].end(), [](const Held1& a, const Held1& b) { return a.turn > b.turn; });
-    const Held1* all = nullptr;
-    for (const Held1& say : says[node])
+    std::sort(says[node].begin(), says[node].end(), [](const Say& a, const Say& b) { return a.turn > b.turn; });
+    const Say* all = nullptr;
+    for (const Say& say : says[node])
       if (say.kind == Kind::wall || say.kind == Kind::inflow) {
         for (const Vec<dim>& normal : say.normals) add(normal, say.value);
         if (!all) all = &say;
@@ -147,7 +153,7 @@ void Fluid<dim>::hold(double t) {
       continue;
     }
     const Vec<dim> with_mesh = mesh_velocity_at(node);
-    for (const Held1& say : says[node])
+    for (const Say& say : says[node])
       for (const Vec<dim>& normal : say.normals) {
         if (say.kind == Kind::slip) {
           add(normal, with_mesh);
@@ -210,7 +216,7 @@ void Fluid<dim>::evaluate_outside(double t) {
     for (std::size_t m = 0; m < x.size(); ++m)
       if (!std::isfinite(outer_pressure_[k][m]) || !outer_velocity_[k][m].allFinite())
         fail("step: pressure and velocity on \"{}\" must be finite, got {} Pa and {} m/s at {}", mesh_->boundary_names[k],
-                                                outer_pressure_[k][m], place(outer_velocity_[k][m]), place(x[m]));
+             outer_pressure_[k][m], place(outer_velocity_[k][m]), place(x[m]));
   }
 }
 

@@ -6,6 +6,7 @@
 #include <Eigen/LU>
 
 #include <cmath>
+#include <type_traits>
 #include <utility>
 
 namespace quicksand::fluid {
@@ -70,6 +71,19 @@ Geometry<dim> geometry(const std::array<Vec<dim>, dim + 1>& x) {
   g.grad_l[0].setZero();
   for (int a = 0; a < dim; ++a) g.grad_l[a + 1] = inverse.row(a), g.grad_l[0] -= g.grad_l[a + 1];
   return g;
+}
+
+template <int dim>
+Geometry<dim> geometry(const std::vector<Vec<dim>>& position, const std::array<int, dim + 1>& nodes) {
+  std::array<Vec<dim>, dim + 1> x;
+  for (int a = 0; a <= dim; ++a) x[a] = position[nodes[a]];
+  return geometry<dim>(x);
+}
+
+// call(order) with the order as a constant.
+template <class Call>
+auto with_order(int order, Call&& call) {
+  return order == 1 ? call(std::integral_constant<int, 1>{}) : call(std::integral_constant<int, 2>{});
 }
 
 template <int dim>

@@ -24,6 +24,10 @@ struct Properties {
 // df/dt = a[0] f(t) + a[1] f(t - dt) + a[2] f(t - 2 dt): backward Euler, BDF2; all 0 for a steady flow.
 using TimeWeights = std::array<double, 3>;  // [1/s]
 
+// The same from the changes of f over the last step and the one before: the weights add up to 0 but for rounding, so what does not change has no
+// rate however short the step.
+inline double rate(const TimeWeights& a, double change, double change_before) { return a[0] * change - a[2] * change_before; }
+
 // Of the grains, at a quadrature point.
 template <int dim>
 struct Reaction {
@@ -81,14 +85,65 @@ Stabilisation<dim> stabilisation(const Geometry<dim>& g, const Properties<dim>& 
   return {1.0 / (fluid.density * rate + std::sqrt(steady + beta_over_eps * beta_over_eps)), std::sqrt(steady) / metric.trace()};
 }
 
-// rho (a[1] U' + a[2] U'') of past subscales at quadrature point q [N/m^3].
+// All that a quadrature point knows before U and p are found.
 template <int dim, int order>
-Vec<dim> memory(const ElementInput<dim, order>& in, const Properties<dim>& fluid, const TimeWeights& time, int q) {
-  Vec<dim> sum = Vec<dim>::Zero();
-  for (int t = 0; t < 2; ++t)
-    if (in.subscale[t]) sum += fluid.density * time[t + 1] * in.subscale[t][q];
-  return sum;
-}
+struct AtPoint {
+  static constexpr int n = shape_count<dim, order>;
+  std::array<double, n> shape;
+  std::array<Vec<dim>, n> grad, grad_u;  // of the shape functions, and of u = U/eps per unit of each unknown
+  std::array<double, n> inertia;         // what acts along U itself per unit of each unknown: rho dU/dt, advection, reaction
+  double eps, eps_rate;                  // d(eps)/dt at a fixed point
+  Vec<dim> grad_eps, relative;           // u - w of the guess, which advects; 0 for Stokes
+  Mat<dim> slope;                        // grad u of the guess, d u_i / d x_j
+  Vec<dim> load;                         // the momentum's other side
+  Vec<dim> past_subscale;                // rho (a[1] U' + a[2] U'') of subscales one and two steps ago [N/m^3]
+  Stabilisation<dim> stab;
+
+  AtPoint(const ElementInput<dim, order>& in, const Geometry<dim>& g, const Properties<dim>& fluid, const TimeWeights& time, int q) {
+    const auto& point = quadrature<dim, order>()[q];
+    const double rho = fluid.density;
+    shape = shapes<dim, order>(point.l);
+    grad = shape_gradients<dim, order>(point.l, g.grad_l);
+    std::array<double, 3> eps_at{};
+    std::array<Vec<dim>, 3> flux;
+    Vec<dim> mesh_velocity = Vec<dim>::Zero();
+    for (int t = 0; t < 3; ++t) {
+      flux[t].setZero();
+      for (int a = 0; a < n; ++a) eps_at[t] += shape[a] * in.eps[t][a], flux[t] += shape[a] * in.flux[t][a];
+    }
+    grad_eps.setZero();
+    for (int a = 0; a < n; ++a) grad_eps += in.eps[0][a] * grad[a];
+    for (int a = 0; a <= dim; ++a) mesh_velocity += point.l[a] * in.mesh_velocity[a];
+    const Reaction<dim> reaction = in.reaction ? in.reaction[q] : Reaction<dim>{};
+    eps = eps_at[0];
+    eps_rate = rate(time, eps_at[0] - eps_at[1], eps_at[1] - eps_at[2]) - mesh_velocity.dot(grad_eps);
+    const double inv_eps = 1.0 / eps;
+    relative = in.advection ? Vec<dim>(flux[0] * inv_eps - mesh_velocity) : Vec<dim>::Zero();
+    slope.setZero();
+    for (int a = 0; a < n; ++a) {
+      grad_u[a] = (grad[a] - shape[a] * inv_eps * grad_eps) * inv_eps;
+      slope += in.flux[0][a] * grad_u[a].transpose();
+      inertia[a] = rho * (time[0] * shape[a] + eps * relative.dot(grad_u[a])) + reaction.beta * inv_eps * shape[a];
+    }
+    const Vec<dim> past = time[1] / eps_at[1] * flux[1] + time[2] / eps_at[2] * flux[2];  // of du/dt
+    load = eps * rho * (fluid.gravity - past) + reaction.beta_target + reaction.force;
+    if (in.newton) load += rho * slope * flux[0];
+    past_subscale.setZero();
+    for (int t = 0; t < 2; ++t)
+      if (in.subscale[t]) past_subscale += rho * time[t + 1] * in.subscale[t][q];
+    stab = stabilisation<dim>(g, fluid, relative, time[0], reaction.beta * inv_eps);
+  }
+
+  // What the viscous force -eps div(2 eta D(u)) is per unit of unknown b, column j by U_j: second derivatives of U/eps, U and eps linear, which do not
+  // vanish where eps varies. Order 1 only.
+  Mat<dim> viscous(int b, double eta) const {
+    static_assert(order == 1);
+    const double inv_eps = 1.0 / eps;
+    const Mat<dim> cross = grad[b] * grad_eps.transpose();
+    const Mat<dim> hessian = (2.0 * shape[b] * inv_eps * grad_eps * grad_eps.transpose() - cross - cross.transpose()) * (inv_eps * inv_eps);
+    return -eps * eta * (hessian + hessian.trace() * Mat<dim>::Identity());
+  }
+};
 
 template <int dim, int order>
 void element_system(const ElementInput<dim, order>& in, const Properties<dim>& fluid, const TimeWeights& time, ElementSystem<dim, order>& out) {
@@ -96,126 +151,74 @@ void element_system(const ElementInput<dim, order>& in, const Properties<dim>& f
   const Geometry<dim> g = geometry<dim>(in.x);
   const double rho = fluid.density, eta = fluid.viscosity;
   out.a.setZero(), out.b.setZero();
-  int q = 0;
-  for (const auto& point : quadrature<dim, order>()) {
-    const double weight = point.weight * g.volume;
-    const auto shape = shapes<dim, order>(point.l);
-    const auto grad = shape_gradients<dim, order>(point.l, g.grad_l);
-    std::array<double, 3> eps{};
-    std::array<Vec<dim>, 3> flux;
-    Vec<dim> grad_eps = Vec<dim>::Zero(), mesh_velocity = Vec<dim>::Zero();
-    for (int t = 0; t < 3; ++t) {
-      flux[t].setZero();
-      for (int a = 0; a < n; ++a) eps[t] += shape[a] * in.eps[t][a], flux[t] += shape[a] * in.flux[t][a];
-    }
-    for (int a = 0; a < n; ++a) grad_eps += in.eps[0][a] * grad[a];
-    for (int a = 0; a <= dim; ++a) mesh_velocity += point.l[a] * in.mesh_velocity[a];
-    const Reaction<dim> reaction = in.reaction ? in.reaction[q] : Reaction<dim>{};
-    const Vec<dim> past_subscale = memory<dim, order>(in, fluid, time, q);
-    ++q;
-    const double inv_eps = 1.0 / eps[0];
-    const Vec<dim> u = flux[0] * inv_eps, relative = in.advection ? Vec<dim>(u - mesh_velocity) : Vec<dim>::Zero();
-    std::array<Vec<dim>, n> grad_u, grad_test;  // of u = U/eps, and of eps w, per unit of each unknown
-    std::array<double, n> carried;              // eps (u - w) . grad u
-    Mat<dim> slope = Mat<dim>::Zero();          // grad u of the guess, d u_i / d x_j
-    for (int a = 0; a < n; ++a) {
-      grad_u[a] = (grad[a] - shape[a] * inv_eps * grad_eps) * inv_eps;
-      grad_test[a] = eps[0] * grad[a] + shape[a] * grad_eps;
-      carried[a] = eps[0] * relative.dot(grad_u[a]);
-      slope += in.flux[0][a] * grad_u[a].transpose();
-    }
-    const Vec<dim> past = time[1] / eps[1] * flux[1] + time[2] / eps[2] * flux[2];  // of du/dt
-    const Vec<dim> load = eps[0] * rho * (fluid.gravity - past) + reaction.beta_target + reaction.force +
-                          (in.newton ? Vec<dim>(rho * slope * flux[0]) : Vec<dim>::Zero());
-    const double eps_rate = time[0] * (eps[0] - eps[1]) - time[2] * (eps[1] - eps[2]) - mesh_velocity.dot(grad_eps);  // at a fixed point
-    const Stabilisation<dim> stab = stabilisation<dim>(g, fluid, relative, time[0], reaction.beta * inv_eps);
-    std::array<double, n> inertia;  // what acts along U itself: rho dU/dt, advection, reaction
-    for (int b = 0; b < n; ++b) inertia[b] = rho * (time[0] * shape[b] + carried[b]) + reaction.beta * inv_eps * shape[b];
+  const auto& rule = quadrature<dim, order>();
+  for (std::size_t q = 0; q < rule.size(); ++q) {
+    const double weight = rule[q].weight * g.volume;
+    const AtPoint<dim, order> at(in, g, fluid, time, static_cast<int>(q));
+    const auto& shape = at.shape;
+    const auto& grad = at.grad;
+    const Stabilisation<dim>& stab = at.stab;
+    std::array<Vec<dim>, n> grad_test;  // of eps w
+    for (int a = 0; a < n; ++a) grad_test[a] = at.eps * grad[a] + shape[a] * at.grad_eps;
 
     for (int a = 0; a < n; ++a) {
       // SUPG: the residual tested with tau rho (u - w) . grad w, beside w. Order 2 does without.
-      const double test = shape[a] + (order == 1 ? stab.tau * rho * relative.dot(grad[a]) : 0.0);
+      const double test = shape[a] + (order == 1 ? stab.tau * rho * at.relative.dot(grad[a]) : 0.0);
       const int row = dof_of<dim>(a);
       for (int b = 0; b < n; ++b) {
         const int column = dof_of<dim>(b);
-        const double diagonal = weight * (test * inertia[b] + eta * grad_u[b].dot(grad_test[a]));
+        const double diagonal = weight * (test * at.inertia[b] + eta * at.grad_u[b].dot(grad_test[a]));
         for (int i = 0; i < dim; ++i) {
           out.a(row + i, column + i) += diagonal;
           for (int j = 0; j < dim; ++j) {
-            double value = eta * grad_u[b][i] * grad_test[a][j] + stab.bulk * grad[a][i] * grad[b][j];
-            if (in.newton) value += test * rho * shape[b] * slope(i, j);
+            double value = eta * at.grad_u[b][i] * grad_test[a][j] + stab.bulk * grad[a][i] * grad[b][j];
+            if (in.newton) value += test * rho * shape[b] * at.slope(i, j);
             out.a(row + i, column + j) += weight * value;
           }
         }
       }
       for (int b = 0; b <= dim; ++b)
-        for (int i = 0; i < dim; ++i) out.a(row + i, dof_of<dim>(b) + dim) += weight * test * eps[0] * g.grad_l[b][i];
-      for (int i = 0; i < dim; ++i) out.b[row + i] += weight * (test * load[i] - stab.bulk * grad[a][i] * eps_rate);
+        for (int i = 0; i < dim; ++i) out.a(row + i, dof_of<dim>(b) + dim) += weight * test * at.eps * g.grad_l[b][i];
+      for (int i = 0; i < dim; ++i) out.b[row + i] += weight * (test * at.load[i] - stab.bulk * grad[a][i] * at.eps_rate);
     }
     for (int a = 0; a <= dim; ++a) {
       const int row = dof_of<dim>(a) + dim;
       for (int b = 0; b < n; ++b)
-        for (int j = 0; j < dim; ++j) out.a(row, dof_of<dim>(b) + j) += weight * point.l[a] * grad[b][j];
+        for (int j = 0; j < dim; ++j) out.a(row, dof_of<dim>(b) + j) += weight * rule[q].l[a] * grad[b][j];
     }
     if constexpr (order == 1) {
-      // The viscous force -eps div(2 eta D(u)) does not vanish where eps varies: second derivatives of U/eps, U and eps linear.
       std::array<Mat<dim>, n> viscous, strong;  // of the momentum, column j by U_j
       for (int b = 0; b < n; ++b) {
-        const Mat<dim> cross = grad[b] * grad_eps.transpose();
-        const Mat<dim> hessian = (2.0 * shape[b] * inv_eps * grad_eps * grad_eps.transpose() - cross - cross.transpose()) * (inv_eps * inv_eps);
-        viscous[b] = -eps[0] * eta * (hessian + hessian.trace() * Mat<dim>::Identity());
-        strong[b] = viscous[b] + inertia[b] * Mat<dim>::Identity();
-        if (in.newton) strong[b] += rho * shape[b] * slope;
+        viscous[b] = at.viscous(b, eta);
+        strong[b] = viscous[b] + at.inertia[b] * Mat<dim>::Identity();
+        if (in.newton) strong[b] += rho * shape[b] * at.slope;
       }
       for (int a = 0; a < n; ++a) {
-        const double along = weight * stab.tau * rho * relative.dot(grad[a]);
+        const double along = weight * stab.tau * rho * at.relative.dot(grad[a]);
         const Vec<dim> test = weight * stab.tau * grad[a];  // PSPG: continuity holds for U less tau times the residual
         const int row = dof_of<dim>(a);
         for (int b = 0; b < n; ++b) {
           const int column = dof_of<dim>(b);
           out.a.template block<dim, dim>(row, column) += along * viscous[b];
           out.a.template block<1, dim>(row + dim, column) += test.transpose() * strong[b];
-          out.a(row + dim, column + dim) += eps[0] * test.dot(grad[b]);
+          out.a(row + dim, column + dim) += at.eps * test.dot(grad[b]);
         }
-        for (int i = 0; i < dim; ++i) out.b[row + i] -= along * past_subscale[i];
-        out.b[row + dim] += test.dot(load - past_subscale);
+        for (int i = 0; i < dim; ++i) out.b[row + i] -= along * at.past_subscale[i];
+        out.b[row + dim] += test.dot(at.load - at.past_subscale);
       }
     }
   }
 }
 
-// The subscale U' at each quadrature point, where U and p are found: rho dU'/dt + U'/tau = -(residual of the momentum).
-// R. Codina, J. Principe, O. Guasch and S. Badia, CMAME 196 (2007).
+// The subscale U' at each quadrature point, where U and p are found.
 template <int dim>
 void element_subscale(const ElementInput<dim, 1>& in, const Properties<dim>& fluid, const TimeWeights& time, const std::array<Vec<dim>, dim + 1>& found, const std::array<double, dim + 1>& p, Vec<dim>* out) {
-  constexpr int n = dim + 1;
   const Geometry<dim> g = geometry<dim>(in.x);
-  const double rho = fluid.density, eta = fluid.viscosity;
-  const auto& grad = g.grad_l;
-  int q = 0;
-  for (const auto& point : quadrature<dim, 1>()) {
-    std::array<double, 3> eps{};
-    std::array<Vec<dim>, 3> flux;
-    Vec<dim> grad_eps = Vec<dim>::Zero(), mesh_velocity = Vec<dim>::Zero(), now = Vec<dim>::Zero(), grad_p = Vec<dim>::Zero();
-    for (int t = 0; t < 3; ++t) {
-      flux[t].setZero();
-      for (int a = 0; a < n; ++a) eps[t] += point.l[a] * in.eps[t][a], flux[t] += point.l[a] * in.flux[t][a];
-    }
-    for (int a = 0; a < n; ++a) grad_eps += in.eps[0][a] * grad[a], mesh_velocity += point.l[a] * in.mesh_velocity[a], now += point.l[a] * found[a], grad_p += p[a] * grad[a];
-    const double inv_eps = 1.0 / eps[0];
-    const Reaction<dim> reaction = in.reaction ? in.reaction[q] : Reaction<dim>{};
-    const Vec<dim> relative = in.advection ? Vec<dim>(flux[0] * inv_eps - mesh_velocity) : Vec<dim>::Zero();
-    Vec<dim> residual = eps[0] * grad_p + rho * time[0] * now + reaction.beta * inv_eps * now - reaction.beta_target - reaction.force -
-                        eps[0] * rho * (fluid.gravity - time[1] / eps[1] * flux[1] - time[2] / eps[2] * flux[2]);
-    for (int b = 0; b < n; ++b) {
-      const Vec<dim> grad_u = (grad[b] - point.l[b] * inv_eps * grad_eps) * inv_eps;
-      const Mat<dim> cross = grad[b] * grad_eps.transpose();
-      const Mat<dim> hessian = (2.0 * point.l[b] * inv_eps * grad_eps * grad_eps.transpose() - cross - cross.transpose()) * (inv_eps * inv_eps);
-      residual += rho * eps[0] * relative.dot(grad_u) * found[b] - eps[0] * eta * (hessian * found[b] + hessian.trace() * found[b]);
-    }
-    const double tau = stabilisation<dim>(g, fluid, relative, time[0], reaction.beta * inv_eps).tau;
-    out[q] = -tau * (residual + memory<dim, 1>(in, fluid, time, q));
-    ++q;
+  for (std::size_t q = 0; q < quadrature<dim, 1>().size(); ++q) {
+    const AtPoint<dim, 1> at(in, g, fluid, time, static_cast<int>(q));
+    Vec<dim> residual = at.past_subscale - at.load;
+    for (int b = 0; b <= dim; ++b) residual += at.eps * p[b] * at.grad[b] + at.inertia[b] * found[b] + at.viscous(b, fluid.viscosity) * found[b];
+    out[q] = -at.stab.tau * residual;
   }
 }
 

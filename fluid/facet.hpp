@@ -1,4 +1,4 @@
-// A facet of the mesh seen from the element that it bounds.
+// A facet of the mesh seen from the element that it bounds, and quadrature on it.
 #pragma once
 
 #include "element.hpp"
@@ -7,12 +7,13 @@
 
 namespace quicksand::fluid {
 
-// A facet seen from its first element: which of the element's corners are its own, and its area times the normal out of the element.
+// Which corners of its first element are the facet's own, and its area times the normal out of that element.
 template <int dim>
 struct FacetView {
   int element;
   std::array<int, dim> corner;
-  Vec<dim> area;  // [m^(dim-1)]
+  Geometry<dim> geometry;  // of the element
+  Vec<dim> area;           // [m^(dim-1)]
   FacetView(const Mesh<dim>& mesh, const std::vector<Vec<dim>>& position, int facet) : FacetView(mesh, facet, [&](int node) { return position[node]; }) {}
   template <class Where>
   FacetView(const Mesh<dim>& mesh, int facet, Where&& where) : element(mesh.facet_elements[facet][0]) {
@@ -24,8 +25,8 @@ struct FacetView {
       const auto& in = mesh.facets[facet];
       std::find(in.begin(), in.end(), node) == in.end() ? void(opposite = a) : void(corner[k++] = a);
     }
-    const Geometry<dim> g = geometry<dim>(x);
-    area = -dim * g.volume * g.grad_l[opposite];  // grad L points to the corner and is one over its height
+    geometry = fluid::geometry<dim>(x);
+    area = -dim * geometry.volume * geometry.grad_l[opposite];  // grad L points to the corner and is one over its height
   }
 };
 

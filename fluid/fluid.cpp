@@ -32,15 +32,13 @@ Fluid<dim>::Fluid(std::shared_ptr<const Mesh<dim>> mesh, int order, Properties<d
   x_.fill(std::vector<double>(space_.dofs(), 0.0));
   guess_ = x_[0];
   if (order == 1) subscale_.fill(std::vector<Vec<dim>>(mesh_->elements.size() * quadrature<dim, 1>().size(), Vec<dim>::Zero()));
-  eps_change_.assign(space_.nodes(), 0.0);
-  old_eps_change_ = eps_change_;
+  eps_change_.fill(std::vector<double>(space_.nodes(), 0.0));
   held_.resize(space_.nodes());
   has_frame_.assign(space_.nodes(), false);
   facets_of_.resize(conditions_.size());
   for (std::size_t f = 0; f < mesh_->facets.size(); ++f) facets_of_[mesh_->boundary[f]].push_back(static_cast<int>(f));
   motion_.resize(conditions_.size());
-  swept_.assign(conditions_.size(), 0.0);
-  old_swept_ = old_swept_used_ = swept_;
+  swept_.fill(std::vector<double>(conditions_.size(), 0.0));
   pore_volume_.fill(pore_volume(eps_[0]));
   outer_pressure_.resize(conditions_.size());
   outer_velocity_.resize(conditions_.size());
@@ -52,7 +50,7 @@ void Fluid<dim>::set_void_fraction(std::span<const double> eps) {
   const std::size_t vertices = mesh_->nodes.size(), all = nodes().size();
   if (eps.size() != vertices && eps.size() != all)
     fail("set_void_fraction: must have one value for each of {} nodes of the mesh{}, got {}", vertices,
-                                            all == vertices ? "" : fmt::format(" or of all {} nodes", all), eps.size());
+         all == vertices ? "" : fmt::format(" or of all {} nodes", all), eps.size());
   for (std::size_t k = 0; k < eps.size(); ++k)
     if (!(eps[k] > 0 && eps[k] <= 1))
       fail("set_void_fraction: must be in (0, 1], got {} at {}", eps[k], place(k < vertices ? position_[k] : nodes()[k]));
@@ -130,20 +128,19 @@ void Fluid<dim>::set_pressure(std::span<const double> p) {
 template <int dim>
 std::vector<Vec<dim>> Fluid<dim>::quadrature_points() const {
   std::vector<Vec<dim>> x;
-  auto add = [&](const auto& rule) {
+  with_order(velocity_order(), [&]<int order>(std::integral_constant<int, order>) {
     for (const auto& element : mesh_->elements)
-      for (const auto& point : rule) {
+      for (const auto& point : quadrature<dim, order>()) {
         x.push_back(Vec<dim>::Zero());
         for (int a = 0; a <= dim; ++a) x.back() += point.l[a] * position_[element[a]];
       }
-  };
-  velocity_order() == 1 ? add(quadrature<dim, 1>()) : add(quadrature<dim, 2>());
+  });
   return x;
 }
 
 template <int dim>
 void Fluid<dim>::set_reaction(std::vector<Reaction<dim>> reaction) {
-  const std::size_t points = mesh_->elements.size() * (velocity_order() == 1 ? quadrature<dim, 1>().size() : quadrature<dim, 2>().size());
+  const std::size_t points = mesh_->elements.size() * with_order(velocity_order(), []<int order>(std::integral_constant<int, order>) { return quadrature<dim, order>().size(); });
   if (!reaction.empty() && reaction.size() != points)
     fail("set_reaction: must have one value for each of {} quadrature points, got {}", points, reaction.size());
   for (std::size_t k = 0; k < reaction.size(); ++k)
@@ -188,8 +185,8 @@ Report Fluid<dim>::step(double dt) {
   try {
     move_mesh(time_ + dt, dt);
     pore_volume_[0] = pore_volume(eps_[0]);
-    for (std::size_t k = 0; k < swept_.size(); ++k) swept_[k] = swept(static_cast<int>(k), dt);
-    eps_change_ = eps_change(dt);
+    for (std::size_t k = 0; k < conditions_.size(); ++k) swept_[0][k] = swept(static_cast<int>(k), dt);
+    eps_change_[0] = eps_change(dt);
     x = solve_step(time_ + dt, time, report);
     account(report, x, time);
   } catch (...) {
@@ -201,7 +198,8 @@ Report Fluid<dim>::step(double dt) {
   x_[1].swap(x_[0]), x_[0].swap(x);
   eps_[2] = eps_[1], eps_[1] = eps_[0];
   pore_volume_[2] = pore_volume_[1], pore_volume_[1] = pore_volume_[0];
-  old_eps_change_ = eps_change_, old_swept_used_ = old_swept_, old_swept_ = swept_;
+  eps_change_[1] = eps_change_[0];
+  swept_[2] = swept_[1], swept_[1] = swept_[0];
   time_weights_ = time, time_ += dt, dt_ = dt;
   ++steps_;
   return report;
@@ -231,7 +229,7 @@ void Fluid<dim>::each_part(Visit&& visit) {
   double steps = steps_, started = eps_started_;
   for (double* one : {&time_, &dt_, &steps, &started}) visit(std::span(one, 1));
   steps_ = static_cast<int>(steps), eps_started_ = started != 0.0;
-  for (auto* many : {&x_[0], &x_[1], &eps_[0], &eps_[1], &eps_[2], &eps_change_, &old_eps_change_, &swept_, &old_swept_, &old_swept_used_}) visit(std::span(*many));
+  for (auto* many : {&x_[0], &x_[1], &eps_[0], &eps_[1], &eps_[2], &eps_change_[0], &eps_change_[1], &swept_[0], &swept_[1], &swept_[2]}) visit(std::span(*many));
   visit(std::span(pore_volume_));
   visit(std::span(time_weights_));
   for (auto* points : {&position_, &mesh_velocity_, &subscale_[0], &subscale_[1]})
@@ -290,7 +288,7 @@ Report Fluid<dim>::solve_steady() {
   check_conditions("solve_steady");
   Report report;
   const TimeWeights time{};
-  for (auto* none : {&eps_change_, &swept_, &old_swept_}) std::fill(none->begin(), none->end(), 0.0);
+  for (auto* none : {&eps_change_[0], &swept_[0], &swept_[1]}) std::fill(none->begin(), none->end(), 0.0);
   std::fill(mesh_velocity_.begin(), mesh_velocity_.end(), Vec<dim>::Zero());
   eps_[2] = eps_[1] = eps_[0];
   pore_volume_.fill(pore_volume(eps_[0]));

@@ -130,11 +130,12 @@ class Fluid {
   struct Harmonic;
   struct Held {  // of a velocity node
     Mat<dim> frame = Mat<dim>::Identity();  // its axes as columns
-    int first = 0, last = 0;                // held axes: first ... last - 1
+    int last = 0;                           // held axes: 0 ... last - 1
     Vec<dim> value = Vec<dim>::Zero();      // of U along them
   };
 
   int boundary_index(const char* function, const std::string& name) const;
+  int outer_boundary(const char* function, const std::string& name) const;
   Condition& condition(const char* function, const std::string& name, Kind kind);
   void check_conditions(const char* function) const;
   bool has_pressure_reference() const;
@@ -167,6 +168,7 @@ class Fluid {
   std::vector<std::pair<int, Vec<dim>>> facet_nodes(int facet) const;
   Vec<dim> velocity_in(int element, const Barycentric<dim>& l) const;
   void spread_surplus(const char* function, const std::vector<double>& x, const TimeWeights& time, std::vector<double>& missing) const;
+  std::vector<double> vertex_volumes() const;
   double mean_pressure(const std::vector<double>& x) const;
   double relative_change(const std::vector<double>& x, const std::vector<double>& before) const;
   double flux_of(const std::vector<double>& x, int boundary) const;
@@ -187,9 +189,9 @@ class Fluid {
   std::array<std::vector<Vec<dim>>, 2> subscale_;  // order 1: at quadrature points, after the last step and the one before [m/s]
   std::vector<double> guess_;                      // that advects
   std::array<double, 3> pore_volume_{};            // int eps: now, and one and two steps ago [m^dim]
-  std::vector<double> swept_, old_swept_, old_swept_used_;  // by each boundary over a step: int eps w . n [m^dim]
+  std::array<std::vector<double>, 3> swept_;       // by each boundary over this step, the last and the one before: int eps w . n [m^dim]
   TimeWeights time_weights_{};                     // of the last step
-  std::vector<double> eps_change_, old_eps_change_;  // int q (change of eps at a fixed point) of a step, per vertex [m^dim]
+  std::array<std::vector<double>, 2> eps_change_;  // over this step and the last: int q (change of eps at a fixed point), per vertex [m^dim]
   std::vector<Reaction<dim>> reaction_;
   std::vector<Held> held_;
   std::vector<char> has_frame_;

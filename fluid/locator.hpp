@@ -41,11 +41,9 @@ class Locator {
     std::optional<std::pair<int, Barycentric<dim>>> best;
     double deepest = -1e-9;
     for (const int e : in_cell_[flat(cell(x))]) {
-      std::array<Vec<dim>, dim + 1> corner;
-      for (int a = 0; a <= dim; ++a) corner[a] = position_[mesh_.elements[e][a]];
-      const Geometry<dim> g = geometry<dim>(corner);
+      const Geometry<dim> g = geometry<dim>(position_, mesh_.elements[e]);
       Barycentric<dim> l;
-      for (int a = 0; a <= dim; ++a) l[a] = 1.0 + g.grad_l[a].dot(x - corner[a]);
+      for (int a = 0; a <= dim; ++a) l[a] = 1.0 + g.grad_l[a].dot(x - position_[mesh_.elements[e][a]]);
       const double least = *std::min_element(l.begin(), l.end());
       if (least > deepest) deepest = least, best = {e, l};
     }

@@ -25,14 +25,14 @@ double Fluid<dim>::flux_of(const std::vector<double>& x, int boundary) const {
       });
     }
   };
-  velocity_order() == 1 ? add(std::integral_constant<int, 1>{}) : add(std::integral_constant<int, 2>{});
+  with_order(velocity_order(), add);
   return sum;
 }
 
 template <int dim>
 double Fluid<dim>::flux(const std::string& boundary) const {
   const int k = boundary_index("flux", boundary);
-  return flux_of(x_[0], k) - (time_weights_[0] * old_swept_[k] - time_weights_[2] * old_swept_used_[k]);
+  return flux_of(x_[0], k) - rate(time_weights_, swept_[1][k], swept_[2][k]);
 }
 
 template <int dim>
@@ -40,15 +40,14 @@ void Fluid<dim>::account(Report& report, const std::vector<double>& x, const Tim
   double area = 0.0, fastest = 0.0, pores = 0.0;
   for (std::size_t k = 0; k < conditions_.size(); ++k) {
     if (conditions_[k].kind == Kind::none) continue;  // inside, or on a periodic side
-    report.net_inflow -= flux_of(x, static_cast<int>(k)) - (time[0] * swept_[k] - time[2] * old_swept_[k]);
+    report.net_inflow -= flux_of(x, static_cast<int>(k)) - rate(time, swept_[0][k], swept_[1][k]);
     for (const int f : facets_of_[k]) area += FacetView<dim>(*mesh_, position_, f).area.norm();
   }
   for (int node = 0; node < space_.nodes(); ++node) {
     fastest = std::max(fastest, Eigen::Map<const Vec<dim>>(&x[space_.first_dof[node]]).norm());
-    if (space_.is_vertex(node)) pores += std::abs(time[0] * eps_change_[node] - time[2] * old_eps_change_[node]);
+    if (space_.is_vertex(node)) pores += std::abs(rate(time, eps_change_[0][node], eps_change_[1][node]));
   }
-  // The weights add up to 0 but for rounding: from differences, pores that do not change have no rate however short the step.
-  report.pore_volume_rate = time[0] * (pore_volume_[0] - pore_volume_[1]) - time[2] * (pore_volume_[1] - pore_volume_[2]);
+  report.pore_volume_rate = rate(time, pore_volume_[0] - pore_volume_[1], pore_volume_[1] - pore_volume_[2]);
   // What rounding leaves of a fluid at rest is no error.
   const double size = fastest * area + pores + 1e-12 * std::abs(time[0] * pore_volume_[0]);
   report.volume_error = size > 0 ? std::abs(report.pore_volume_rate - report.net_inflow) / size : 0.0;
@@ -106,13 +105,11 @@ auto Fluid<dim>::error(const VectorField<dim>& velocity, const ScalarField<dim>&
   std::vector<double> p, weight;
   for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
     const auto& corners = mesh_->elements[e];
-    std::array<Vec<dim>, dim + 1> corner;
-    for (int a = 0; a <= dim; ++a) corner[a] = position_[corners[a]];
-    const double volume = geometry<dim>(corner).volume;
+    const double volume = geometry<dim>(position_, corners).volume;
     for (const auto& point : quadrature<dim, 2>()) {
       Vec<dim> where = Vec<dim>::Zero();
       double value = 0.0;
-      for (int a = 0; a <= dim; ++a) where += point.l[a] * corner[a], value += point.l[a] * x_[0][space_.pressure_dof(space_.vertex[corners[a]])];
+      for (int a = 0; a <= dim; ++a) where += point.l[a] * position_[corners[a]], value += point.l[a] * x_[0][space_.pressure_dof(space_.vertex[corners[a]])];
       x.push_back(where), p.push_back(value), weight.push_back(point.weight * volume);
       u.push_back(velocity_in(static_cast<int>(e), point.l));
     }
@@ -131,14 +128,14 @@ template <int dim>
 Vec<dim> Fluid<dim>::velocity_in(int element, const Barycentric<dim>& l) const {
   double eps = 0.0;
   Vec<dim> flux = Vec<dim>::Zero();
-  auto add = [&](const auto& shape) {
-    for (int a = 0; a < space_.per_element; ++a) {
+  with_order(velocity_order(), [&]<int order>(std::integral_constant<int, order>) {
+    const auto shape = shapes<dim, order>(l);
+    for (int a = 0; a < shape_count<dim, order>; ++a) {
       const int node = space_.node_of[element * space_.per_element + a];
       eps += shape[a] * eps_[1][node];
       flux += shape[a] * Eigen::Map<const Vec<dim>>(&x_[0][space_.first_dof[node]]);
     }
-  };
-  velocity_order() == 1 ? add(shapes<dim, 1>(l)) : add(shapes<dim, 2>(l));
+  });
   return flux / eps;
 }
 
@@ -152,9 +149,7 @@ auto Fluid<dim>::probe(std::span<const Vec<dim>> x) const -> std::vector<Probe> 
     const auto& [element, l] = *where;
     const auto& corners = mesh_->elements[element];
     Probe probe{Vec<dim>::Zero(), 0.0, Vec<dim>::Zero()};
-    std::array<Vec<dim>, dim + 1> corner;
-    for (int a = 0; a <= dim; ++a) corner[a] = position_[corners[a]];
-    const Geometry<dim> g = geometry<dim>(corner);
+    const Geometry<dim> g = geometry<dim>(position_, corners);
     for (int a = 0; a <= dim; ++a) {
       const double p = x_[0][space_.pressure_dof(space_.vertex[corners[a]])];
       probe.pressure += l[a] * p, probe.pressure_gradient += p * g.grad_l[a];

@@ -15,10 +15,7 @@ using meshes::place;
 
 template <int dim>
 void Fluid<dim>::move_boundary(const std::string& boundary, VectorField<dim> velocity) {
-  const int k = boundary_index("move_boundary", boundary);
-  for (const int f : facets_of_[k])
-    if (mesh_->facet_elements[f][1] >= 0) fail("move_boundary: \"{}\" has facets inside the domain or on a periodic side", boundary);
-  motion_[k] = std::move(velocity);
+  motion_[outer_boundary("move_boundary", boundary)] = std::move(velocity);
   harmonic_.reset();
 }
 
@@ -59,7 +56,7 @@ std::vector<double> Fluid<dim>::eps_change(double dt) const {
           });
     }
   };
-  velocity_order() == 1 ? sum(std::integral_constant<int, 1>{}) : sum(std::integral_constant<int, 2>{});
+  with_order(velocity_order(), sum);
   return change;
 }
 
@@ -68,17 +65,15 @@ double Fluid<dim>::pore_volume(const std::vector<double>& eps) const {
   double sum = 0.0;
   auto add = [&]<int order>(std::integral_constant<int, order>) {
     for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
-      std::array<Vec<dim>, dim + 1> corner;
-      for (int a = 0; a <= dim; ++a) corner[a] = position_[mesh_->elements[e][a]];
       double mean = 0.0;
       for (const auto& point : quadrature<dim, order>()) {
         const auto shape = shapes<dim, order>(point.l);
         for (int a = 0; a < shape_count<dim, order>; ++a) mean += point.weight * shape[a] * eps[space_.node_of[e * space_.per_element + a]];
       }
-      sum += geometry<dim>(corner).volume * mean;
+      sum += geometry<dim>(position_, mesh_->elements[e]).volume * mean;
     }
   };
-  velocity_order() == 1 ? add(std::integral_constant<int, 1>{}) : add(std::integral_constant<int, 2>{});
+  with_order(velocity_order(), add);
   return sum;
 }
 
@@ -102,7 +97,7 @@ double Fluid<dim>::swept(int boundary, double dt) const {
       }
     }
   };
-  velocity_order() == 1 ? add(std::integral_constant<int, 1>{}) : add(std::integral_constant<int, 2>{});
+  with_order(velocity_order(), add);
   return sum;
 }
 
@@ -137,9 +132,7 @@ std::vector<Vec<dim>> Fluid<dim>::harmonic(const std::vector<std::vector<int>>& 
         if (space_.is_vertex(node) && !is_held[axis][node]) row[node] = free++;
       std::vector<Eigen::Triplet<double>> inner, outer;
       for (const auto& element : mesh_->elements) {
-        std::array<Vec<dim>, dim + 1> corner;
-        for (int a = 0; a <= dim; ++a) corner[a] = mesh_->nodes[element[a]];
-        const Geometry<dim> g = geometry<dim>(corner);
+        const Geometry<dim> g = geometry<dim>(mesh_->nodes, element);
         for (int a = 0; a <= dim; ++a)
           for (int b = 0; b <= dim; ++b) {
             const int i = space_.vertex[element[a]], j = space_.vertex[element[b]];
@@ -213,12 +206,9 @@ void Fluid<dim>::move_mesh(double t, double dt) {
   }
   mesh_velocity_ = mesh_motion == MeshMotion::harmonic ? harmonic(moved, velocity) : stretch(moved, velocity);
   for (std::size_t k = 0; k < position_.size(); ++k) position_[k] = old_position_[k] + dt * mesh_velocity_[k];
-  for (const auto& element : mesh_->elements) {
-    std::array<Vec<dim>, dim + 1> corner;
-    for (int a = 0; a <= dim; ++a) corner[a] = position_[element[a]];
-    if (!(geometry<dim>(corner).volume > 0))
-      fail("step: moving the boundaries over {:.4g} s folds the mesh at {} m; take smaller steps, or make a new mesh", dt, place(corner[0]));
-  }
+  for (const auto& element : mesh_->elements)
+    if (!(geometry<dim>(position_, element).volume > 0))
+      fail("step: moving the boundaries over {:.4g} s folds the mesh at {} m; take smaller steps, or make a new mesh", dt, place(position_[element[0]]));
 }
 
 template class Fluid<2>;  // of the members defined here

@@ -64,11 +64,18 @@ Space<dim>::Space(std::shared_ptr<const Mesh<dim>> the_mesh, int order, int rank
   }
   first_of_rank.push_back(dof);
   begin = first_of_rank[rank], end = first_of_rank[rank + 1];
+  node_at.assign(dofs(), -1), is_pressure.assign(dofs(), false);
+  for (int node = 0; node < nodes(); ++node) {
+    node_at[first_dof[node]] = node;
+    if (is_vertex(node)) is_pressure[pressure_dof(node)] = true;
+  }
 
   std::vector<std::vector<int>> near(nodes());  // nodes that share an element, by number of dof
+  local_of.assign(count, -1);
   for (int e = 0; e < count; ++e) {
     const int* node = &node_of[e * per_element];
     if (std::none_of(node, node + per_element, [&](int k) { return mine(k); })) continue;
+    local_of[e] = static_cast<int>(elements.size());
     elements.push_back(e);
     for (int a = 0; a < per_element; ++a)
       if (mine(node[a])) near[node[a]].insert(near[node[a]].end(), node, node + per_element);

@@ -25,10 +25,13 @@ struct Space {
   bool is_vertex(int node) const { return between[node][0] == between[node][1]; }
   int pressure_dof(int node) const { return first_dof[node] + dim; }
   int dofs_at(int node) const { return is_vertex(node) ? dim + 1 : dim; }
+  std::vector<int> node_at;       // of each dof, the velocity node whose dofs begin there, or -1
+  std::vector<char> is_pressure;  // of each dof
 
   // This rank's rows, in compressed form.
   int begin, end;                 // dofs
   std::vector<int> elements;      // that touch one of its nodes
+  std::vector<int> local_of;      // of each element of the mesh, its index in `elements`, or -1
   std::vector<int> row_start, column;
   std::vector<int> place;         // per element of `elements` and pair of its nodes: where in each row of the first the columns of the
                                   // second begin; -1: the row is another rank's
