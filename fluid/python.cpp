@@ -79,14 +79,27 @@ ScalarField<dim> scalar_field(const py::object& value, const char* what) {
   return [value, what](std::span<const Vec<dim>> x, double t) { return scalars(value(copied<dim>(x), t), x.size(), what); };
 }
 
+// The words for the values of a choice, both ways.
 template <class T>
-T one_of(const char* what, const std::string& name, std::initializer_list<std::pair<const char*, T>> known) {
+using Words = std::initializer_list<std::pair<const char*, T>>;
+constexpr Words<int> elements = {{"p1p1", 1}, {"p2p1", 2}};
+constexpr Words<Advection> advections = {{"none", Advection::none}, {"extrapolated", Advection::extrapolated}, {"newton", Advection::newton}};
+constexpr Words<Scheme> schemes = {{"bdf2", Scheme::bdf2}, {"backward_euler", Scheme::backward_euler}};
+constexpr Words<Method> methods = {{"direct", Method::direct}, {"ilu", Method::ilu}, {"fieldsplit", Method::fieldsplit}};
+
+template <class T>
+T one_of(const char* what, const std::string& name, const Words<T>& known) {
   std::vector<std::string> names;
   for (const auto& [word, value] : known) {
     if (name == word) return value;
     names.emplace_back(word);
   }
   throw std::invalid_argument(fmt::format("{} must be one of {}, got \"{}\"", what, names, name));
+}
+
+template <class T>
+const char* word_for(T value, const Words<T>& known) {
+  return std::find_if(known.begin(), known.end(), [&](const auto& pair) { return pair.second == value; })->first;
 }
 
 // What is given as a field and used at the quadrature points of a step.
@@ -172,13 +185,14 @@ py::dict frame(const FluidInPython<dim>& f) {
 template <int dim>
 void add_fluid(py::module_& m, const char* name) {
   using F = FluidInPython<dim>;
+  static constexpr Words<typename F::MeshMotion> motions = {{"harmonic", F::MeshMotion::harmonic}, {"stretch", F::MeshMotion::stretch}};
   py::class_<F>(m, name)
       .def(py::init([](std::shared_ptr<Mesh<dim>> mesh, double density, double viscosity, const std::string& element, const py::object& gravity) {
              Properties<dim> properties;
              properties.density = density, properties.viscosity = viscosity;
              if (!gravity.is_none()) properties.gravity = vectors<dim>(gravity, 1, "Fluid: gravity")[0];
              if (!properties.gravity.allFinite()) throw std::invalid_argument("Fluid: gravity must be finite [m/s^2]");
-             return std::make_unique<F>(mesh, one_of<int>("Fluid: element", element, {{"p1p1", 1}, {"p2p1", 2}}), properties);
+             return std::make_unique<F>(mesh, one_of("Fluid: element", element, elements), properties);
            }),
            "mesh"_a, py::kw_only(), "density"_a, "viscosity"_a, "element"_a = "p1p1", "gravity"_a = py::none())
       .def("wall", [](F& f, const std::string& b, const py::object& v) { f.set_wall(b, v.is_none() ? VectorField<dim>() : vector_field<dim>(v, "wall: velocity")); },
@@ -196,8 +210,8 @@ void add_fluid(py::module_& m, const char* name) {
            "A plate that lets fluid through: the fluid slides with it (its velocity [m/s]; none: that of the boundary), and crosses it against the pressure behind [Pa].")
       .def("move_boundary", [](F& f, const std::string& b, const py::object& v) { f.move_boundary(b, vector_field<dim>(v, "move_boundary: velocity")); }, "boundary"_a, "velocity"_a,
            "Moves a boundary from the next step on, at (dim,) or f(x, t) [m/s], and the mesh with it: see `mesh_motion`.")
-      .def_property("mesh_motion", [](const F& f) { return f.mesh_motion == F::MeshMotion::harmonic ? "harmonic" : "stretch"; },
-                    [](F& f, const std::string& name) { f.mesh_motion = one_of<typename F::MeshMotion>("mesh_motion", name, {{"harmonic", F::MeshMotion::harmonic}, {"stretch", F::MeshMotion::stretch}}); },
+      .def_property("mesh_motion", [](const F& f) { return word_for(f.mesh_motion, motions); },
+                    [](F& f, const std::string& name) { f.mesh_motion = one_of("mesh_motion", name, motions); },
                     "of the inside: \"harmonic\" (nodes on boundaries that stay slide along axes), or \"stretch\", linear between two boundaries that move as a whole")
       .def("mean_pressure", &F::set_mean_pressure, "pressure"_a = 0.0, "Mean pressure [Pa] where no boundary gives one.")
       .def_property("void_fraction", [](const F& f) { return copied(f.void_fraction()); },
@@ -241,7 +255,7 @@ void add_fluid(py::module_& m, const char* name) {
       .def_property_readonly("dofs", [](const F& f) { return f.space().dofs(); }, "unknowns")
       .def_property_readonly("dim", [](const F&) { return dim; })
       .def_property_readonly("mesh", [](const F& f) { return std::const_pointer_cast<Mesh<dim>>(f.space().mesh); }, "as it was at the start: `nodes` tells where it is")
-      .def_property_readonly("element", [](const F& f) { return f.velocity_order() == 1 ? "p1p1" : "p2p1"; })
+      .def_property_readonly("element", [](const F& f) { return word_for(f.velocity_order(), elements); })
       .def("force", &F::force, "boundary"_a, "Of the fluid on a boundary (dim,) [N] (2D: N/m).")
       .def("torque",
            [](const F& f, const std::string& boundary, const py::object& centre) -> py::object {
@@ -269,18 +283,18 @@ void add_fluid(py::module_& m, const char* name) {
              return std::pair(e.velocity, e.pressure);
            },
            "velocity"_a, "pressure"_a, "Relative L2 errors of velocity and pressure against fields f(x, t) at the present time.")
-      .def_property("advection", [](const F& f) { return f.settings.advection == Advection::none ? "none" : f.settings.advection == Advection::newton ? "newton" : "extrapolated"; },
+      .def_property("advection", [](const F& f) { return word_for(f.settings.advection, advections); },
                     [](F& f, const std::string& name) {
-                      f.settings.advection = one_of<Advection>("advection", name, {{"none", Advection::none}, {"extrapolated", Advection::extrapolated}, {"newton", Advection::newton}});
+                      f.settings.advection = one_of("advection", name, advections);
                     },
                     "\"none\" (Stokes), \"extrapolated\" (one linear system a step), \"newton\"")
-      .def_property("scheme", [](const F& f) { return f.settings.scheme == Scheme::bdf2 ? "bdf2" : "backward_euler"; },
-                    [](F& f, const std::string& name) { f.settings.scheme = one_of<Scheme>("scheme", name, {{"bdf2", Scheme::bdf2}, {"backward_euler", Scheme::backward_euler}}); },
+      .def_property("scheme", [](const F& f) { return word_for(f.settings.scheme, schemes); },
+                    [](F& f, const std::string& name) { f.settings.scheme = one_of("scheme", name, schemes); },
                     "\"bdf2\" (its first step is backward Euler) or \"backward_euler\"")
-      .def_property("solver", [](const F& f) { return f.settings.linear ? (f.settings.linear->method == Method::direct ? "direct" : f.settings.linear->method == Method::ilu ? "ilu" : "fieldsplit") : "auto"; },
+      .def_property("solver", [](const F& f) { return f.settings.linear ? word_for(f.settings.linear->method, methods) : "auto"; },
                     [](F& f, const std::string& name) {
                       if (name == "auto") f.settings.linear.reset();
-                      else f.settings.linear = LinearSettings{.method = one_of<Method>("solver", name, {{"direct", Method::direct}, {"ilu", Method::ilu}, {"fieldsplit", Method::fieldsplit}})};
+                      else f.settings.linear = LinearSettings{.method = one_of("solver", name, methods)};
                     },
                     "of the linear systems, before the first step: \"direct\" (MUMPS), \"ilu\", \"fieldsplit\", or \"auto\": direct in 2D, in 3D ilu for p1p1 and fieldsplit for p2p1")
       .def_property("newton_tolerance", [](const F& f) { return f.settings.newton_tolerance; }, [](F& f, double v) { f.settings.newton_tolerance = v; })
