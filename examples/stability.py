@@ -53,7 +53,6 @@ Keys of one case:
         _PHI_SOLVER_TOLERANCE_DT; haff_series_time [tau] and haff_series_temperature [T0], each _RESTITUTION_PHI
 """
 
-import sys
 import time
 from pathlib import Path
 
@@ -525,32 +524,6 @@ def haff(flags):
     return rows, series
 
 
-CASES = {case.__name__: case for case in (stack, column, sizes, overlaps, tunnel, big_steps, friction, elastic, crystal, wedge, haff)}
-
-
-def parse_flags():
-    parser = study.CommandLine(__doc__)
-    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
-    parser.add_argument("--out", type=Path, default=Path("out/stability"))
-    parser.add_argument("--quick", action="store_true")
-    flags = parser.parse_args()
-    with parser.user_errors():
-        flags.out.mkdir(parents=True, exist_ok=True)
-    return flags
-
-
-def table(case, rows):
-    """Markdown of a case's rows."""
-    def text(value):
-        if value is None or value != value:
-            return "-"
-        return f"{value:.3g}" if isinstance(value, (float, np.floating)) else str(value)
-
-    names = list(rows[0])
-    lines = [f"## {case}", "", "| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
-    return "\n".join(lines + ["| " + " | ".join(text(row[name]) for name in names) + " |" for row in rows]) + "\n"
-
-
 def plot(out, results):
     def curves(prefix, x, y):
         """Of the series whose names begin so: (label, x, y)."""
@@ -575,19 +548,7 @@ def plot(out, results):
             + [("Haff's law", COLOURS[-1], t, (1 + t) ** -2)])], scales=("linear", "log"))
 
 
-def main():
-    flags = parse_flags()
-    results, tables = {}, []
-    for case in flags.cases:
-        rows, series = CASES[case](flags)
-        results |= {f"{case}_{name}": [row[name] for row in rows] for name in rows[0]} | {f"{case}_{name}": v for name, v in series.items()}
-        tables.append(table(case, rows))
-        print(tables[-1], flush=True)
-        (flags.out / "tables.md").write_text("\n".join(tables))
-        study.write_results(flags.out / "results.json", results)
-    plot(flags.out, results)
-    return 0
-
+CASES = (stack, column, sizes, overlaps, tunnel, big_steps, friction, elastic, crystal, wedge, haff)
 
 if __name__ == "__main__":
-    sys.exit(main())
+    study.run_cases(__doc__, Path("out/stability"), CASES, plot)

@@ -43,7 +43,6 @@ Keys of one case, relative to the exact value unless said:
         reynolds_change, of the last iteration or of the last step over its dt
 """
 
-import sys
 import time
 from pathlib import Path
 
@@ -168,7 +167,7 @@ def steps(flags):
                 section = max(section or 0.0, abs(w @ f / w.sum() - 1))
         rows.append(run.row(width=width, low=low, reynolds=1 / viscosity, beta=beta, section_error=section, pressure_error=abs(fall / exact - 1),
                             overshoot=beyond(u, 1.0, 1 / low) * low, flux_error=float(np.abs(flow.velocity * flow.void_fraction[:, None] - along).max())))
-    return rows
+    return rows, {}
 
 
 def rest(flags):
@@ -212,7 +211,7 @@ def rest(flags):
                     p = flow.pressure
                     off = p - p.mean() + rho * g * (x - x.mean())
                     rows.append(run.row(gravity="xy"[axis], fastest=float(fastest), pressure_error=float(np.abs(off).max() / (rho * g))))
-    return rows
+    return rows, {}
 
 
 def peclet(flags):
@@ -244,7 +243,7 @@ def peclet(flags):
             far = np.abs(offset(flow.nodes)) > 2 * h if number >= 100 else None
             rows.append(run.row(number=number, overshoot=beyond(u, 1, 1 + jump) / jump,
                                 away_error=None if far is None else float(np.abs(flow.velocity - inflow(flow.nodes, 0))[far].max() / jump)))
-    return rows
+    return rows, {}
 
 
 def courant(flags):
@@ -290,7 +289,7 @@ def courant(flags):
                 run.go(dt, 40, lambda: energies.append(mean_square(run.flow)))
                 rows.append(run.row(number=number, dt=dt, energy=None, growth=max(energies, default=np.nan) / start,
                                     velocity_error=rms(run.flow.velocity - still.flow.velocity) / rms(still.flow.velocity) if number >= 10 else None))
-    return rows
+    return rows, {}
 
 
 def cavity(n, element, reynolds):
@@ -359,7 +358,7 @@ def small_steps(flags):
                 run.go(dt, 9)
                 size = rms(u0)
                 rows.append(run.row(dt=dt, before=before, first=first, tenth=off(), velocity_error=rms(run.flow.velocity - u0) / size if size else None))
-    return rows
+    return rows, {}
 
 
 def darcy(flags):
@@ -423,7 +422,7 @@ def darcy(flags):
             errors = flow.error(lambda x, t: np.column_stack([np.ones(len(x)), 0 * x[:, 0]]), lambda x, t: beta * np.minimum(1 - x[:, 0], 0.5) + 1e-300)
             rows.append(run.row(number=number, velocity_error=errors[0], pressure_error=errors[1] if beta else None, flux_error=abs(flow.flux("right") / 0.5 - 1),
                                 overshoot=beyond(flow.velocity[:, 0], 1, 1)))
-    return rows
+    return rows, {}
 
 
 def aspect(flags):
@@ -470,7 +469,7 @@ def aspect(flags):
                 run.go(gap, 5 if flags.quick else 20)
                 errors = flow.error(profile, lambda x, t, gap=gap: 8 / gap * (1 - x[:, 0]))
                 rows.append(run.row(number=number, solver=solver, velocity_error=errors[0], pressure_error=errors[1]))
-    return rows
+    return rows, {}
 
 
 def backflow(flags):
@@ -513,7 +512,7 @@ def backflow(flags):
                 flow.slip(side)
             run.go(0.1, 20 if flags.quick else 200)
             rows.append(run.row(strength=1 / viscosity, growth=mean_square(flow), end=abs(flow.flux("right") - 1)))
-    return rows
+    return rows, {}
 
 
 # Lowest velocity along the middle: U. Ghia, K. N. Ghia and C. T. Shin, J. Comput. Phys. 48 (1982); 1000: O. Botella and R. Peyret, Comput. Fluids 27 (1998).
@@ -572,33 +571,7 @@ def reynolds(flags):
             rows.append(run.row(number=float(number), start="rest", fastest_return=None, reference=None, change=run.change))
             if not found:
                 break
-    return rows
-
-
-CASES = {case.__name__: case for case in (steps, rest, peclet, courant, small_steps, darcy, aspect, backflow, reynolds)}
-
-
-def parse_flags():
-    parser = study.CommandLine(__doc__)
-    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
-    parser.add_argument("--out", type=Path, default=Path("out/stability_fluid"))
-    parser.add_argument("--quick", action="store_true")
-    flags = parser.parse_args()
-    with parser.user_errors():
-        flags.out.mkdir(parents=True, exist_ok=True)
-    return flags
-
-
-def table(case, rows):
-    """Markdown of a case's rows."""
-    def text(value):
-        if value is None or value != value:
-            return "-"
-        return f"{value:.3g}" if isinstance(value, (float, np.floating)) else str(value)
-
-    names = list(rows[0])
-    lines = [f"## {case}", "", "| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
-    return "\n".join(lines + ["| " + " | ".join(text(row[name]) for name in names) + " |" for row in rows]) + "\n"
+    return rows, {}
 
 
 def plot(out, results):
@@ -629,19 +602,7 @@ def plot(out, results):
             for scene in ("vortices, extrapolated", "vortices, newton")])
 
 
-def main():
-    flags = parse_flags()
-    results, tables = {}, []
-    for case in flags.cases:
-        rows = CASES[case](flags)
-        results |= {f"{case}_{name}": [row[name] for row in rows] for name in rows[0]}
-        tables.append(table(case, rows))
-        print(tables[-1], flush=True)
-        (flags.out / "tables.md").write_text("\n".join(tables))
-        study.write_results(flags.out / "results.json", results)
-    plot(flags.out, results)
-    return 0
-
+CASES = (steps, rest, peclet, courant, small_steps, darcy, aspect, backflow, reynolds)
 
 if __name__ == "__main__":
-    sys.exit(main())
+    study.run_cases(__doc__, Path("out/stability_fluid"), CASES, plot)

@@ -1,5 +1,6 @@
-"""examples/stability.py: its cases, keys and figures, and what a short run of it must show."""
+"""examples/stability.py and stability_fluid.py: their cases, keys and figures, and what a short run of them must show."""
 
+import functools
 import json
 import os
 import re
@@ -11,17 +12,30 @@ import pytest
 
 import quicksand
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "stability.py"
+FOLDER = Path(__file__).parents[2] / "examples"
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(quicksand.__file__).parents[1]), "OMP_WAIT_POLICY": "passive"}
-CASES = "stack column sizes overlaps tunnel big_steps friction elastic crystal wedge haff".split()
+CASES = {"stability": "stack column sizes overlaps tunnel big_steps friction elastic crystal wedge haff".split(),
+         "stability_fluid": "steps rest peclet courant small_steps darcy aspect backflow reynolds".split()}
+FIGURES = {"stability": ("column.png", "elastic.png", "haff.png"), "stability_fluid": ("peclet.png", "small_steps.png", "darcy.png", "courant.png")}
+SMALLEST = {"stability": 5000, "stability_fluid": 4000}  # file [B]
+LIMIT = {"stability": 120, "stability_fluid": 200}  # of all cases [s]
+
+
+def go(example, out, *args, limit):
+    environment = ENVIRONMENT | ({"OMP_NUM_THREADS": "1"} if example == "stability_fluid" else {})
+    return subprocess.run([sys.executable, FOLDER / f"{example}.py", "--quick", "--out", out, *args], env=environment, capture_output=True, text=True, timeout=limit)
 
 
 @pytest.fixture(scope="module")
 def quick(tmp_path_factory):
-    out = tmp_path_factory.mktemp("stability")
-    done = subprocess.run([sys.executable, EXAMPLE, "--quick", "--out", out], env=ENVIRONMENT, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0 and done.stderr == "", done.stderr
-    return json.loads((out / "results.json").read_text()), out, done.stdout
+    """A quick run of an example, once: its results, folder and standard output."""
+    @functools.cache
+    def run(example):
+        out = tmp_path_factory.mktemp(example)
+        done = go(example, out, limit=LIMIT[example])
+        assert done.returncode == 0 and done.stderr == "", done.stderr
+        return json.loads((out / "results.json").read_text()), out, done.stdout
+    return run
 
 
 def rows(results, case):
@@ -30,19 +44,20 @@ def rows(results, case):
     return [dict(zip(lists, row)) for row in zip(*lists.values(), strict=True)]
 
 
-def test_every_case_has_its_rows_and_keys_and_the_docstring_names_them(quick):
-    results, out, printed = quick
-    text = EXAMPLE.read_text().split('"""')[1]
-    for case in CASES:
+@pytest.mark.parametrize("example", CASES)
+def test_every_case_has_its_rows_and_keys_and_the_docstring_names_them(quick, example):
+    results, out, printed = quick(example)
+    text = (FOLDER / f"{example}.py").read_text().split('"""')[1]
+    for case in CASES[example]:
         assert len(rows(results, case)) >= 2 and f"## {case}" in printed
         for key in rows(results, case)[0]:
             assert re.search(rf"\b(?:{case}_)?{key}\b", text), f"{case}_{key} is not in the docstring"
-    for name in ("column.png", "elastic.png", "haff.png", "tables.md"):
-        assert (out / name).stat().st_size > 5000
+    for name in (*FIGURES[example], "tables.md"):
+        assert (out / name).stat().st_size > SMALLEST[example]
 
 
-def test_what_must_hold_in_a_short_run_too(quick):
-    results, _, _ = quick
+def test_what_must_hold_of_dry_grains_in_a_short_run_too(quick):
+    results, _, _ = quick("stability")
     assert all(row["force_error"] < 1e-4 for row in rows(results, "stack") if row["solver"] in ("auto", "newton") and row["tolerance"] == 1e-6)
     assert any(row["unconverged"] for row in rows(results, "stack") if row["solver"] == "nlgs")  # else the case would be an easy one
     assert all(row["made"] == 0 for row in rows(results, "overlaps") if row["scene"] != "pile")
@@ -54,9 +69,19 @@ def test_what_must_hold_in_a_short_run_too(quick):
     assert elastic["collision_rate"] == pytest.approx(1, abs=0.1) and inelastic["rate"] == pytest.approx(1, abs=0.15)
 
 
-def test_one_case_alone_and_a_wrong_name(tmp_path):
-    go = lambda *args: subprocess.run([sys.executable, EXAMPLE, "--quick", "--out", tmp_path, *args], env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
-    assert go("--cases", "overlaps").returncode == 0
-    assert {name.split("_")[0] for name in json.loads((tmp_path / "results.json").read_text())} == {"overlaps"}
-    wrong = go("--cases", "hourglass")
+def test_what_must_hold_of_the_fluid_in_a_short_run_too(quick):
+    results, _, _ = quick("stability_fluid")
+    assert all(row["fastest"] < 1e-7 for row in rows(results, "rest") if row["fastest"] is not None and row["scene"] != "step sinks")
+    assert all(row["overshoot"] < 0.2 for row in rows(results, "peclet") if row["element"] == "p1p1")
+    assert all(row["growth"] < 1.1 for case in ("courant", "backflow") for row in rows(results, case))
+    small = [row for row in rows(results, "small_steps") if row["scene"] in ("channel", "impulse")]
+    assert all(row["first"] < 0.05 for row in small if row["dt"] >= 1e-6 or row["scene"] == "channel")
+    assert all(row["overshoot"] < 1e-6 for row in rows(results, "darcy") if row["scene"] == "interface" and row["overshoot"] is not None)
+
+
+@pytest.mark.parametrize("example, case", [("stability", "overlaps"), ("stability_fluid", "peclet")])
+def test_one_case_alone_and_a_wrong_name(tmp_path, example, case):
+    assert go(example, tmp_path, "--cases", case, limit=LIMIT[example] / 2).returncode == 0
+    assert {name.split("_")[0] for name in json.loads((tmp_path / "results.json").read_text())} == {case}
+    wrong = go(example, tmp_path, "--cases", "hourglass", limit=LIMIT[example] / 2)
     assert wrong.returncode == 2 and wrong.stderr.count("\n") == 1 and "hourglass" in wrong.stderr
