@@ -14,7 +14,7 @@ struct Impulse {
 };
 
 // A contact that the solver sees: n points from body i to body j, u = velocity of j relative to i at the contact.
-// Exact for discs and spheres: the local Delassus block is diagonal, W_tt = W_nn (1 + m r^2/I). Not so for clumps.
+// Exact for discs and spheres: the local Delassus block is diagonal, W_tt = W_nn (1 + m r^2/I) without drag. Not so for clumps.
 // 64 bytes in 2D, one cache line: what a sweep does not read (which pair it is) is kept apart.
 template <int dim>
 struct alignas(dim == 2 ? 64 : 32) Contact {
@@ -90,6 +90,15 @@ struct Change {
   Real speed2{};          // (W_nn |dp|)^2 [m^2/s^2]
 };
 
-enum class Law { frictionless, coulomb, coulomb_restitution };
+// general: Coulomb with tangential restitution, or with drag, under which a grain is heavier to push than to turn.
+enum class Law { frictionless, coulomb, general };
+
+// What the general law needs of a contact beside its data. Without drag the spin ratios are m r^2/I and W_nn/W_tt = 1/(1 + m r^2/I).
+template <int dim>
+struct General {
+  Tangent<dim> bias_t;     // see Problem::bias_t
+  double ratio_i, ratio_j; // see Problem::spin_ratios
+  double rolling;          // W_nn/W_tt [-]
+};
 
 }  // namespace quicksand

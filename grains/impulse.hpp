@@ -12,25 +12,26 @@ Vec<dim> impulse_vector(const Vec<dim>& n, double p_n, const Tangent<dim>& p_t) 
   return p_n * n + tangent_vector(n, p_t);
 }
 
+// Spin ratios of the bodies: see Problem::spin_ratios.
 template <Law law, int dim>
-[[gnu::always_inline]] inline void push(Body<dim>& a, Body<dim>& b, const Vec<dim>& n, double p_n, const Tangent<dim>& p_t, double spin_ratio) {
+[[gnu::always_inline]] inline void push(Body<dim>& a, Body<dim>& b, const Vec<dim>& n, double p_n, const Tangent<dim>& p_t, double ratio_a, double ratio_b) {
   Vec<dim> p = p_n * n;
   if constexpr (law != Law::frictionless) p += tangent_vector(n, p_t);
   a.v -= a.inv_m * p;
   b.v += b.inv_m * p;
   if constexpr (law != Law::frictionless) {
-    const Spin<dim> torque = spin_ratio * turn(n, p_t);
-    a.s -= a.inv_m * torque;
-    b.s -= b.inv_m * torque;
+    const Spin<dim> torque = turn(n, p_t);
+    a.s -= a.inv_m * Spin<dim>(ratio_a * torque);
+    b.s -= b.inv_m * Spin<dim>(ratio_b * torque);
   }
 }
 
 template <Law law, int dim>
-[[gnu::always_inline]] inline void push(Wall<dim>& wall, Body<dim>& b, const Vec<dim>& n, double p_n, const Tangent<dim>& p_t, double spin_ratio) {
+[[gnu::always_inline]] inline void push(Wall<dim>& wall, Body<dim>& b, const Vec<dim>& n, double p_n, const Tangent<dim>& p_t, double, double ratio_b) {
   const Vec<dim> p = impulse_vector<dim>(n, p_n, p_t);
   wall.v -= wall.inv_m.cwiseProduct(p);
   b.v += b.inv_m * p;
-  if constexpr (law != Law::frictionless) b.s -= (b.inv_m * spin_ratio) * turn(n, p_t);
+  if constexpr (law != Law::frictionless) b.s -= (b.inv_m * ratio_b) * turn(n, p_t);
 }
 
 // Relative velocity at the contact: normal part, then tangential part.

@@ -47,7 +47,9 @@ class BlockLU {
 };
 
 // One proximal problem: u = (W + alpha D) r + q - alpha D r_k, D = W_nn of each contact. Alart and Curnier's function, one contact:
-//   f_n = r_n - (r_n - rho u_n)+ ,   f_t = r_t - P_disc(mu (r_n - rho u_n)+)(r_t - rho u_t) ,   rho = 1/W_nn
+//   f_n = r_n - (r_n - rho u_n)+ ,   f_t = r_t - P_disc(mu (r_n - rho u_n)+)(r_t - rho_t u_t) ,   rho = 1/W_nn
+// rho_t = rho but where drag makes W_tt many times W_nn (of full discs and spheres 3 and 3.5): r_t - rho u_t would then overshoot the disc
+// however small the slip, and one contact that sticks would take more than 500 iterations.
 template <int dim>
 class ProximalProblem {
  public:
@@ -63,7 +65,9 @@ class ProximalProblem {
     for (int c = 0; c < problem_.contacts(); ++c) {
       const Vec<dim> r_c = r.template segment<dim>(dim * c);
       const double w = w_nn(c);
-      trial_[c] = r_c - (row_velocity(problem_, r, c) / w + alpha_ * (r_c - centre_.template segment<dim>(dim * c)));
+      Vec<dim> way = row_velocity(problem_, r, c) / w + alpha_ * (r_c - centre_.template segment<dim>(dim * c));
+      way.template tail<t>() *= share_t(c);
+      trial_[c] = r_c - way;
       Vec<dim> f = r_c;
       if (const double n = trial_[c][0]; n > 0) {
         const VecT z = trial_[c].template tail<t>();
@@ -117,6 +121,10 @@ class ProximalProblem {
 
  private:
   double w_nn(int c) const { return problem_.blocks[problem_.diagonal[c]](0, 0); }
+  double share_t(int c) const {  // rho_t/rho
+    const double w_tt = problem_.blocks[problem_.diagonal[c]].diagonal().template tail<t>().mean();
+    return w_tt > 4 * w_nn(c) ? 4 * w_nn(c) / w_tt : 1.0;
+  }
 
   std::pair<Mat<dim>, Mat<dim>> derivative(int c) const {  // of a closed contact
     Mat<dim> own = Mat<dim>::Zero(), by_velocity = Mat<dim>::Zero();
@@ -135,6 +143,7 @@ class ProximalProblem {
       by_velocity.template block<t, t>(1, 1) = turning;
       by_velocity.template block<t, 1>(1, 0) = friction * way;
     }
+    by_velocity.template rightCols<t>() *= share_t(c);
     return {own, by_velocity};
   }
 

@@ -101,6 +101,11 @@ int Simulation<dim>::add(std::span<const Vec<dim>> x, std::span<const double> ra
     grains_.material.push_back(m);
   }
   if (!grains_.force.empty()) grains_.force.resize(grains_.x.size(), Vec<dim>::Zero());
+  if (dragged()) {
+    drag_.coefficient.resize(n_free_, 0.0);
+    for (auto* of_grain : {&drag_.velocity, &drag_.impulse, &drag_.contact_impulse}) of_grain->resize(n_free_, Vec<dim>::Zero());
+    drag_.in_contact.resize(n_free_, 0);
+  }
   places_changed();
   return first;
 }
@@ -230,6 +235,45 @@ void Simulation<dim>::set_force(std::span<const Vec<dim>> force) {
   grains_.force.assign(grains_.x.size(), Vec<dim>::Zero());
   for (int k = 0; k < grains_.size(); ++k)
     if (grains_.id[k] >= 0) grains_.force[k] = force[grains_.id[k]];
+}
+
+template <int dim>
+void Simulation<dim>::set_drag(std::span<const double> coefficient, std::span<const Vec<dim>> velocity) {
+  if (coefficient.empty() && velocity.empty()) {
+    drag_ = {};
+    spin_ratios_.clear();
+  } else {
+    set_by_id(coefficient.size(), "set_drag", "coefficient");
+    set_by_id(velocity.size(), "set_drag", "velocity");
+    for (std::size_t k = 0; k < coefficient.size(); ++k) {
+      if (!(coefficient[k] >= 0) || !is_finite(coefficient[k]))
+        fail("set_drag: coefficient must be >= 0 kg/s and finite, got {} (grain {})", coefficient[k], k);
+      check_finite(velocity[k], "set_drag", "velocity [m/s]", k);
+    }
+    drag_.coefficient.assign(coefficient.begin(), coefficient.end());
+    drag_.velocity.assign(velocity.begin(), velocity.end());
+    for (auto* of_step : {&drag_.impulse, &drag_.contact_impulse}) of_step->resize(n_free_, Vec<dim>::Zero());
+    drag_.in_contact.resize(n_free_, 0);
+  }
+  contacts_current_ = false;
+}
+
+template <int dim>
+const std::vector<Vec<dim>>& Simulation<dim>::drag_impulse() const {
+  if (!dragged()) fail("drag_impulse: there is no drag; call set_drag");
+  return drag_.impulse;
+}
+
+template <int dim>
+const std::vector<Vec<dim>>& Simulation<dim>::contact_impulse() const {
+  if (!dragged()) fail("contact_impulse: kept only while there is drag; call set_drag");
+  return drag_.contact_impulse;
+}
+
+template <int dim>
+const std::vector<std::uint8_t>& Simulation<dim>::in_contact() const {
+  if (!dragged()) fail("in_contact: kept only while there is drag; call set_drag");
+  return drag_.in_contact;
 }
 
 template <int dim>

@@ -90,6 +90,10 @@ class Simulation {
   void set_inertia(double ratio);                                             // I/(m r^2) [-]
   void set_force(std::span<const Vec<dim>> force);                            // by id [N]; empty: none
 
+  // From now on a fluid drags every grain with gamma (u - v), v its velocity at the end of a sub-step: stable for any gamma. By id:
+  // gamma [kg/s] (2D: kg/(m s)), u [m/s]. It exerts no torque. Empty: none. Grains added later have none.
+  void set_drag(std::span<const double> coefficient, std::span<const Vec<dim>> velocity);
+
   void check(double dt);  // throws what step(dt) would refuse, and changes nothing
   StepReport<dim> step(double dt);
 
@@ -105,6 +109,11 @@ class Simulation {
   const Neighbours<dim>& neighbours() const { return neighbours_; }
   std::size_t memory() const;  // bytes held in arrays that grow with the number of grains
   ContactList<dim> contacts() const;
+
+  // What the last step did to each grain, by id: kept while there is drag; without it they throw std::invalid_argument.
+  const std::vector<Vec<dim>>& drag_impulse() const;       // sum of h gamma (u - v) [N s] (2D: N s/m)
+  const std::vector<Vec<dim>>& contact_impulse() const;    // of all contacts together [N s]
+  const std::vector<std::uint8_t>& in_contact() const;     // whether any contact bore load in any sub-step
 
   // The contact problem of the last sub-step and the impulses that were found for it [N s] (2D: N s/m); see delassus().
   // Throws std::invalid_argument where no sub-step was made since the scene was changed from outside or restored.
@@ -154,6 +163,11 @@ class Simulation {
   SolveReport solve_contacts(double h);
   bool rebound(double h);
   void accelerate(double h);
+  double speed_gain(double h) const;
+  void weigh(double h);
+  void unweigh();
+  void note_contacts();
+  bool dragged() const { return !drag_.coefficient.empty(); }
   void account(double h, StepReport<dim>& report);
   void move(double h);
   void set_by_id(std::size_t size, const char* where, const char* what) const;
@@ -165,6 +179,12 @@ class Simulation {
   std::vector<Wall<dim>> walls_;
   Materials materials_;
   Neighbours<dim> neighbours_;
+  struct Drag {  // by id; all empty: none
+    std::vector<double> coefficient;     // gamma [kg/s] (2D: kg/(m s))
+    std::vector<Vec<dim>> velocity;      // u [m/s]
+    std::vector<Vec<dim>> impulse, contact_impulse;  // of the last step [N s] (2D: N s/m)
+    std::vector<std::uint8_t> in_contact;
+  } drag_;
   int n_free_ = 0, n_fixed_ = 0;
   double time_ = 0.0;
   double last_h_ = 0.0;  // sub-step that the stored impulses belong to [s]
@@ -179,7 +199,8 @@ class Simulation {
     int shared = 1;           // what makes the steps: 1, all
     int left = 0, wait = 200; // steps to the next trial of the other, and from that to the one after it
   } pace_;
-  double mean_radius_ = 0.0, max_radius_ = 0.0, acceleration_ = 0.0;
+  double mean_radius_ = 0.0, max_radius_ = 0.0, acceleration_ = 0.0;  // without drag
+  double wall_acceleration_ = 0.0;
   double wall_mass_ = 0.0;  // of load-driven walls whose mass nobody gave: a tenth of the grains' [kg]
   bool friction_ = false, restitution_ = false, tangential_restitution_ = false;
   std::vector<double> gap_;
@@ -191,6 +212,7 @@ class Simulation {
   std::vector<Tangent<dim>> bias_t_, wall_bias_t_;
   std::vector<Body<dim>> body_before_;
   std::vector<Vec<dim>> wall_before_;
+  std::vector<double> spin_ratios_;  // see Problem; empty: no drag
   std::vector<Sums> sums_;
 };
 

@@ -44,32 +44,30 @@ double inv_w_t(const C& c, double rolling) {
 
 // One contact update; a is a Body or a Wall. Inlined by order: called, it costs three times as much.
 template <Law law, int dim, class A, class C>
-[[gnu::always_inline]] inline Change<> update(A& a, Body<dim>& b, C& c, const Tangent<dim>* bias_t, double spin_ratio,
-                                          double omega) {
+[[gnu::always_inline]] inline Change<> update(A& a, Body<dim>& b, C& c, const General<dim>& general, double omega) {
   Slip<dim> u = slip<law, dim>(a, b, c.n);
   u.n += c.bias;
   if (c.p.n == 0.0 && u.n >= 0.0) return {};  // open and stays open; an extrapolated impulse may be negative
-  if constexpr (law == Law::coulomb_restitution) u.t += *bias_t;
-  const double rolling = 1.0 / (1.0 + spin_ratio);
+  if constexpr (law == Law::general) u.t += general.bias_t;
   Impulse<dim> next;
   if constexpr (law == Law::frictionless)
     next.n = std::max(c.p.n - omega * c.inv_w * u.n, 0.0);
   else
-    next = obey_coulomb<dim>(c.p, u.n, u.t, omega * c.inv_w, omega * inv_w_t(c, rolling), c.friction);
+    next = obey_coulomb<dim>(c.p, u.n, u.t, omega * c.inv_w, omega * inv_w_t(c, general.rolling), c.friction);
   const double dn = next.n - c.p.n;
   const Tangent<dim> dt = next.t - c.p.t;
-  push<law>(a, b, c.n, dn, dt, spin_ratio);
+  push<law>(a, b, c.n, dn, dt, general.ratio_i, general.ratio_j);
   c.p = next;
   const double w = 1.0 / c.inv_w, change = w * (dn * dn + squared(dt));
   return {change, w * (next.n * next.n + squared(next.t)), w * change};
 }
 
 template <Law law, int dim, class A, class C>
-Change<> error(const A& a, const Body<dim>& b, const C& c, const Tangent<dim>* bias_t) {
+Change<> error(const A& a, const Body<dim>& b, const C& c, const General<dim>& general) {
   Slip<dim> u = slip<law, dim>(a, b, c.n);
   u.n += c.bias;
   if (c.p.n == 0.0 && u.n >= 0.0) return {};  // open: e = 0
-  if constexpr (law == Law::coulomb_restitution) u.t += *bias_t;
+  if constexpr (law == Law::general) u.t += general.bias_t;
   const double w = 1.0 / c.inv_w, change = w * natural_map<dim>(c.p, u.n, u.t, c.inv_w, c.friction);
   return {change, w * (c.p.n * c.p.n + squared(c.p.t)), w * change};
 }
@@ -226,7 +224,7 @@ class Sweeper {
     int total = 0;
     for (std::size_t b = 0; b < n_blocks; ++b) s_.first[b] = total, total += s_.units[b];
     resize_tight(s_.packs, total);
-    if (law == Law::coulomb_restitution) s_.bias_t.assign(total, PackBias{});
+    if (law == Law::general) resize_tight(s_.general, total);
 #pragma omp parallel num_threads(p_.threads)
     each_block(p_, [&](int b) { fill_packs(b); });
   }
@@ -252,8 +250,7 @@ class Sweeper {
       empty.inv_w = 0.0, empty.p = {};
       for (int lane = 0; lane < 4; ++lane) {
         put(pack, lane, slots[lane] < 0 ? empty : p_.contacts[slots[lane]]);
-        if (law == Law::coulomb_restitution && slots[lane] >= 0 && !p_.bias_t.empty())
-          s_.bias_t[s_.first[b] + k].t[lane] = p_.bias_t[slots[lane]];
+        if constexpr (law == Law::general) put(s_.general[s_.first[b] + k], lane, general(slots[slots[lane] < 0 ? 3 : lane]));
       }
     }
   }
@@ -263,6 +260,28 @@ class Sweeper {
       return s_.packs[s_.first[b] + k];
     else
       return p_.contacts[p_.blocks[b].begin + k];
+  }
+
+  General<dim> general(int slot) const {
+    General<dim> g{zero<Tangent<dim>>(), p_.spin_ratio, p_.spin_ratio, rolling_};
+    if constexpr (law == Law::general) {
+      if (!p_.bias_t.empty()) g.bias_t = p_.bias_t[slot];
+      if (!p_.spin_ratios.empty()) {
+        const Contact<dim>& c = p_.contacts[slot];
+        g.ratio_i = p_.spin_ratios[c.i], g.ratio_j = p_.spin_ratios[c.j];
+        const double w_i = p_.bodies[c.i].inv_m, w_j = p_.bodies[c.j].inv_m;
+        g.rolling = (w_i + w_j) / (w_i * (1.0 + g.ratio_i) + w_j * (1.0 + g.ratio_j));
+      }
+    }
+    return g;
+  }
+  General<dim> wall_general(int k) const {
+    General<dim> g{zero<Tangent<dim>>(), p_.spin_ratio, p_.spin_ratio, 0.0};  // W_tt: that of the contact
+    if constexpr (law == Law::general) {
+      if (!p_.wall_bias_t.empty()) g.bias_t = p_.wall_bias_t[k];
+      g.ratio_j = p_.spin_ratio_of(p_.wall_contacts[k].j);
+    }
+    return g;
   }
 
   std::size_t unit_at(std::size_t b, int k) const { return wide ? s_.first[b] + k : p_.blocks[b].begin + k; }
@@ -276,10 +295,9 @@ class Sweeper {
     for (int a = 0; a < n; ++a) {
       const int k = what == Pass::back ? n - 1 - a : listed ? wall_list_[a] : a;
       WallContact<dim>& c = p_.wall_contacts[k];
-      const Tangent<dim>* bias_t = p_.wall_bias_t.empty() ? nullptr : &p_.wall_bias_t[k];
       const Change<> change = what == Pass::residual
-                                  ? error<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, bias_t)
-                                  : update<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, bias_t, p_.spin_ratio, omega);
+                                  ? error<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, wall_general(k))
+                                  : update<law, dim>(p_.walls[c.wall], p_.bodies[c.j], c, wall_general(k), omega);
       sums += change;
       wall_list_[n_wall_listed_] = k;
       n_wall_listed_ += change.change > settled_energy_ || change.speed2 > settled_speed2_;
@@ -322,17 +340,17 @@ class Sweeper {
     };
     Body<dim>* const bodies = p_.bodies.data();
     if constexpr (wide) {
-      auto bias_t = [&](int k) { return law == Law::coulomb_restitution ? &s_.bias_t[s_.first[b] + k].t : nullptr; };
+      auto of_pack = [&](int k) { return law == Law::general ? &s_.general[s_.first[b] + k] : nullptr; };
       if (what == Pass::residual)
-        visit([&](Pack& c, int k) { return error<law>(c, bodies, bias_t(k)); });
+        visit([&](Pack& c, int k) { return error<law>(c, bodies, of_pack(k)); });
       else
-        visit([&](Pack& c, int k) { return update<law>(c, bodies, bias_t(k), p_.spin_ratio, omega); });
+        visit([&](Pack& c, int k) { return update<law>(c, bodies, of_pack(k), p_.spin_ratio, omega); });
     } else {
-      auto bias_t = [&](int k) { return law == Law::coulomb_restitution ? &p_.bias_t[p_.blocks[b].begin + k] : nullptr; };
+      const int first = p_.blocks[b].begin;
       if (what == Pass::residual)
-        visit([&](auto& c, int k) { return error<law, dim>(bodies[c.i], bodies[c.j], c, bias_t(k)); });
+        visit([&](auto& c, int k) { return error<law, dim>(bodies[c.i], bodies[c.j], c, general(first + k)); });
       else
-        visit([&](auto& c, int k) { return update<law, dim>(bodies[c.i], bodies[c.j], c, bias_t(k), p_.spin_ratio, omega); });
+        visit([&](auto& c, int k) { return update<law, dim>(bodies[c.i], bodies[c.j], c, general(first + k), omega); });
     }
     s_.listed[b] = static_cast<int>(end - list);
     Sums sums;
@@ -362,6 +380,7 @@ class Sweeper {
 
   Problem<dim>& p_;
   Scratch& s_;
+  const double rolling_ = 1.0 / (1.0 + p_.spin_ratio);
   std::vector<Sums> sums_;
   Sums total_, wall_sums_;
   std::vector<int> wall_list_;  // wall contacts that have not settled
@@ -504,8 +523,8 @@ template <int dim, class Solve>
 SolveReport by_law(const Problem<dim>& problem, Solve&& solve) {
   using enum Law;
   if (!problem.friction) return solve(std::integral_constant<Law, frictionless>());
-  if (problem.bias_t.empty() && problem.wall_bias_t.empty()) return solve(std::integral_constant<Law, coulomb>());
-  return solve(std::integral_constant<Law, coulomb_restitution>());
+  if (problem.bias_t.empty() && problem.wall_bias_t.empty() && problem.spin_ratios.empty()) return solve(std::integral_constant<Law, coulomb>());
+  return solve(std::integral_constant<Law, general>());
 }
 
 }  // namespace
@@ -527,17 +546,17 @@ SolveReport solve_accelerated(Problem<dim>& problem, const SolverSettings& setti
 
 template <int dim>
 void warm_start(Problem<dim>& problem) {
-  auto start = [&](auto& a, Body<dim>& b, const auto& c) {
-    if (c.p.n > 0.0) push<Law::coulomb>(a, b, c.n, c.p.n, c.p.t, problem.spin_ratio);
+  auto start = [&](auto& a, Body<dim>& b, const auto& c, double ratio_a) {
+    if (c.p.n > 0.0) push<Law::coulomb>(a, b, c.n, c.p.n, c.p.t, ratio_a, problem.spin_ratio_of(c.j));
   };
 #pragma omp parallel num_threads(problem.threads)
   each_block(problem, [&](int b) {
     for (int k = problem.blocks[b].begin; k < problem.blocks[b].begin + problem.count[b]; ++k) {
       const Contact<dim>& c = problem.contacts[k];
-      start(problem.bodies[c.i], problem.bodies[c.j], c);
+      start(problem.bodies[c.i], problem.bodies[c.j], c, problem.spin_ratio_of(c.i));
     }
   });
-  for (const WallContact<dim>& c : problem.wall_contacts) start(problem.walls[c.wall], problem.bodies[c.j], c);
+  for (const WallContact<dim>& c : problem.wall_contacts) start(problem.walls[c.wall], problem.bodies[c.j], c, 0.0);
 }
 
 template SolveReport solve_nlgs(Problem<2>&, const SolverSettings&);

@@ -22,7 +22,7 @@ void resize_tight(Vector& values, std::size_t n) {
 // What solvers keep in memory from one problem to the next.
 struct Scratch {
   std::vector<Pack> packs;                // 2D: the contacts, block by block
-  std::vector<PackBias> bias_t;           // of each pack
+  std::vector<PackGeneral> general;       // of each pack, for the general law
   std::vector<std::array<int, 4>> slots;  // of the contacts of each pack, from the first slot of a block on; -1: empty lane
   std::vector<int> first, units;          // per block: first pack; packs, or in 3D contacts
   std::vector<int> list, listed;          // per slot, per block: what has not settled
@@ -42,8 +42,12 @@ struct Problem {
   std::span<const Tangent<dim>> wall_bias_t;
   Scratch& scratch;
   double spin_ratio;                              // m r^2/I [-]
+  // With drag a body's inverse mass is 1/(m + h gamma), but its spin is as light as ever: (m + h gamma) r^2/I per body [-]; empty: no drag.
+  std::span<const double> spin_ratios;
   bool friction;                                  // false: no contact has any, and nothing turns
   int threads;
+
+  double spin_ratio_of(int body) const { return spin_ratios.empty() ? spin_ratio : spin_ratios[body]; }
 };
 
 struct SolverSettings {

@@ -1,5 +1,6 @@
 // The step of a scene; reads as its own table of contents from step() on.
 #include "errors.hpp"
+#include "impulse.hpp"
 #include "simulation.hpp"
 
 #include <chrono>
@@ -39,6 +40,10 @@ StepReport<dim> Simulation<dim>::step(double dt) {
   StepReport<dim> report;
   report.dt = dt;
   for (Wall<dim>& wall : walls_) wall.force.setZero();
+  if (dragged()) {
+    for (auto* of_step : {&drag_.impulse, &drag_.contact_impulse}) std::fill(of_step->begin(), of_step->end(), Vec<dim>::Zero());
+    std::fill(drag_.in_contact.begin(), drag_.in_contact.end(), 0);
+  }
 
   for (double left = dt; left > 0;) {
     Motion motion = measure_pairs();
@@ -46,7 +51,7 @@ StepReport<dim> Simulation<dim>::step(double dt) {
     // How near a pair must be to touch in this sub-step: half as much again as the fastest of all neighbours moves relative to another,
     // for a grain may be pushed faster than any moved before. Pairs that are no neighbours yet must not come that near, by
     // their own motion and half of that.
-    auto alert = [&](double speed) { return 1.5 * h * (speed + h * acceleration_) + 0.01 * mean_radius_; };
+    auto alert = [&](double speed) { return 1.5 * h * (speed + speed_gain(h)) + 0.01 * mean_radius_; };
     if (!neighbours_.valid(grains_, walls_, alert(motion.speed) / 3, h, threads_)) {
       neighbours_.find(grains_, walls_, box_, std::clamp(3 * alert(motion.speed), skin * mean_radius_, max_radius_ * 2), threads_);
       motion = measure_pairs();
@@ -78,6 +83,10 @@ StepReport<dim> Simulation<dim>::step(double dt) {
     }
     contacts_current_ = true;
     account(h, report);
+    if (dragged()) {
+      note_contacts();
+      unweigh();
+    }
     move(h);
 
     left = h < left ? left - h : 0.0;
@@ -159,7 +168,7 @@ void Simulation<dim>::check(double dt) {
   }
   acceleration_ += gravity.norm();
   mean_radius_ = n > 0 ? r_sum / n : 0.0;
-  double wall_acceleration = 0.0;
+  wall_acceleration_ = 0.0;
   wall_mass_ = 0.1 * mass;
   for (const Wall<dim>& wall : walls_) {
     used[wall.material] = 1;
@@ -168,10 +177,10 @@ void Simulation<dim>::check(double dt) {
       if (!wall.loaded[k]) continue;
       const double m = wall.mass > 0 ? wall.mass : wall_mass_;
       if (m == 0.0) fail("step: load-driven wall {} needs a mass [kg] where there are no grains", &wall - walls_.data());
-      wall_acceleration = std::max(wall_acceleration, std::abs(wall.load[k]) / m);
+      wall_acceleration_ = std::max(wall_acceleration_, std::abs(wall.load[k]) / m);
     }
   }
-  acceleration_ += wall_acceleration;
+  acceleration_ += wall_acceleration_;
   friction_ = restitution_ = tangential_restitution_ = false;
   for (std::size_t a = 0; a < used.size(); ++a)
     for (std::size_t b = 0; b < used.size(); ++b) {
@@ -184,7 +193,7 @@ void Simulation<dim>::check(double dt) {
       tangential_restitution_ |= pair.tangential > 0;
     }
   // No two come closer faster than this; a billion sub-steps is no simulation, but a slip of the pen.
-  const double speed = std::sqrt(v2_max) + dt * acceleration_;
+  const double speed = std::sqrt(v2_max) + speed_gain(dt);
   if (n > 0 && dt * speed > 1e9 * settings.sub_step_motion * r_min)
     fail("step: dt = {} s takes more than 1e9 sub-steps at speeds up to {:.4g} m/s with a smallest radius of {:.4g} m", dt, speed, r_min);
   if (!places_checked_) check_places();
@@ -347,7 +356,7 @@ double Simulation<dim>::sub_step_length(double left, double dt, const Motion& mo
   if (grains_.size() == 0) return left;
   double parts = 1.0;
   if (settings.sub_steps == SubSteps::relative) {
-    const double rate = motion.rate + left * acceleration_ / (2 * mean_radius_);
+    const double rate = motion.rate + speed_gain(left) / (2 * mean_radius_);
     parts = std::ceil(left * rate / settings.sub_step_motion);
   } else {
     double v2_max = 0.0, r_min = std::numeric_limits<double>::infinity();
@@ -356,6 +365,45 @@ double Simulation<dim>::sub_step_length(double left, double dt, const Motion& mo
     parts = std::round(left / dt * std::max(1.0, std::ceil(8 * std::sqrt(v2_max) * dt / r_min)));
   }
   return left / std::max(parts, 1.0);
+}
+
+// The most by which gravity, forces, drag and loads change a velocity in time h.
+template <int dim>
+double Simulation<dim>::speed_gain(double h) const {
+  if (!dragged()) return h * acceleration_;
+  const int n = grains_.size();
+  double most = 0.0;
+#pragma omp parallel for num_threads(threads_) schedule(static) reduction(max : most)
+  for (int k = 0; k < n; ++k) {
+    const Body<dim>& b = grains_.body[k];
+    if (b.inv_m == 0) continue;
+    const double rate = drag_.coefficient[grains_.id[k]] * b.inv_m;
+    Vec<dim> a = gravity + rate * (drag_.velocity[grains_.id[k]] - b.v);
+    if (!grains_.force.empty()) a += b.inv_m * grains_.force[k];
+    most = std::max(most, a.norm() / (1.0 + h * rate));
+  }
+  return h * (most + wall_acceleration_);
+}
+
+// m (v - v_before) = h gamma (u - v) + other impulses: to these a grain is as heavy as m + h gamma, for its translation only.
+// The true masses stay in body_before_.
+template <int dim>
+void Simulation<dim>::weigh(double h) {
+  const int n = grains_.size();
+  spin_ratios_.assign(n, 1.0 / grains_.inertia);
+#pragma omp parallel for num_threads(threads_) schedule(static)
+  for (int k = 0; k < n; ++k) {
+    Body<dim>& b = grains_.body[k];
+    if (b.inv_m == 0) continue;
+    const double heavier = 1.0 + h * drag_.coefficient[grains_.id[k]] * b.inv_m;
+    b.inv_m /= heavier;
+    spin_ratios_[k] *= heavier;
+  }
+}
+
+template <int dim>
+void Simulation<dim>::unweigh() {
+  for (int k = 0; k < grains_.size(); ++k) grains_.body[k].inv_m = body_before_[k].inv_m;
 }
 
 template <int dim>
@@ -369,6 +417,16 @@ void Simulation<dim>::accelerate(double h) {
       if (b.inv_m == 0) continue;
       b.v += h * gravity;
       if (forced) b.v += h * b.inv_m * grains_.force[k];
+    }
+  }
+  if (dragged()) {
+    weigh(h);
+#pragma omp parallel for num_threads(threads_) schedule(static)
+    for (int k = 0; k < n; ++k) {
+      Body<dim>& b = grains_.body[k];
+      if (b.inv_m == 0) continue;
+      const int id = grains_.id[k];
+      b.v += h * drag_.coefficient[id] * b.inv_m * (drag_.velocity[id] - b.v);  // (v + k u)/(1 + k), k = h gamma/m
     }
   }
   for (Wall<dim>& wall : walls_) wall.v += h * wall.inv_m.cwiseProduct(wall.load);
@@ -422,9 +480,10 @@ void Simulation<dim>::find_contacts(double h, double alert, double wall_alert) {
     c.n = near_wall(pair).n;
     c.bias = std::max(gap_[n + k], 0.0) / h;
     c.inv_w = 1.0 / (body.inv_m + c.n.cwiseProduct(wall.inv_m).dot(c.n));
-    c.inv_w_t = 1.0 / (body.inv_m * (1 + 1 / grains_.inertia) + wall.inv_m.maxCoeff());
+    const double spin_ratio = spin_ratios_.empty() ? 1 / grains_.inertia : spin_ratios_[pair.j];
+    c.inv_w_t = 1.0 / (body.inv_m * (1 + spin_ratio) + wall.inv_m.maxCoeff());
     if constexpr (dim == 2)
-      c.inv_w_t = 1.0 / (body.inv_m * (1 + 1 / grains_.inertia) + c.n.y() * c.n.y() * wall.inv_m.x() + c.n.x() * c.n.x() * wall.inv_m.y());
+      c.inv_w_t = 1.0 / (body.inv_m * (1 + spin_ratio) + c.n.y() * c.n.y() * wall.inv_m.x() + c.n.x() * c.n.x() * wall.inv_m.y());
     c.friction = law_of(pair).friction;
     c.p = {scale * pair.p.n, scale * onto_plane(pair.p.t, c.n)};
     c.wall = pair.wall;
@@ -448,6 +507,7 @@ Problem<dim> Simulation<dim>::problem() {
       .wall_bias_t = {},
       .scratch = scratch_,
       .spin_ratio = 1.0 / grains_.inertia,
+      .spin_ratios = spin_ratios_,
       .friction = friction_,
       .threads = threads_,
   };
@@ -459,7 +519,12 @@ std::pair<DelassusProblem<dim>, Eigen::VectorXd> Simulation<dim>::contact_proble
     fail("contact_problem: there is none before the first step, nor after the scene was changed from outside or restored; make a step first");
   Problem<dim> last = problem();
   if (tangential_restitution_) last.bias_t = bias_t_, last.wall_bias_t = wall_bias_t_;
-  return delassus(last);
+  if (!dragged()) return delassus(last);
+  weigh(last_h_);
+  last.spin_ratios = spin_ratios_;
+  auto problem_and_impulses = delassus(last);
+  unweigh();
+  return problem_and_impulses;
 }
 
 template <int dim>
@@ -594,16 +659,22 @@ void Simulation<dim>::account(double h, StepReport<dim>& report) {
       kinetic += 0.5 * after * after / walls_[w].inv_m[k];
       kinetic_before += 0.5 * before * before / walls_[w].inv_m[k];
     }
-  const bool pulled = !gravity.isZero(0.0), forced = !grains_.force.empty();
+  const bool pulled = !gravity.isZero(0.0), forced = !grains_.force.empty(), dragged = this->dragged();
   for (int k = 0; k < grains_.size(); ++k) {
     const Body<dim>&before = body_before_[k], &after = grains_.body[k];
-    if (after.inv_m == 0) continue;
-    const double m = 1.0 / after.inv_m;
+    if (before.inv_m == 0) continue;
+    const double m = 1.0 / before.inv_m;  // after: with drag, see weigh()
     kinetic += 0.5 * m * (after.v.squaredNorm() + grains_.inertia * squared(after.s));
     kinetic_before += 0.5 * m * (before.v.squaredNorm() + grains_.inertia * squared(before.s));
-    if (!pulled && !forced) continue;
+    if (!pulled && !forced && !dragged) continue;
     Vec<dim> f = m * gravity;
     if (forced) f += grains_.force[k];
+    if (dragged) {
+      const int id = grains_.id[k];
+      const Vec<dim> drag = drag_.coefficient[id] * (drag_.velocity[id] - after.v);
+      drag_.impulse[id] += h * drag;
+      f += drag;
+    }
     work_forces += 0.5 * h * f.dot(before.v + after.v);
   }
   report.kinetic_energy = kinetic;
@@ -611,6 +682,25 @@ void Simulation<dim>::account(double h, StepReport<dim>& report) {
   report.work_forces += work_forces;
   report.dissipation -= power;
   report.energy_balance_error += kinetic - kinetic_before - work_walls - work_forces - power;
+}
+
+// Who touches, and the impulses that come of it, by id.
+template <int dim>
+void Simulation<dim>::note_contacts() {
+  auto note = [&](int k, const Vec<dim>& p) {
+    if (grains_.id[k] < 0) return;
+    drag_.contact_impulse[grains_.id[k]] += p;
+    drag_.in_contact[grains_.id[k]] = 1;
+  };
+  for (std::size_t b = 0; b < count_.size(); ++b)
+    for (int k = neighbours_.blocks[b].begin; k < neighbours_.blocks[b].begin + count_[b]; ++k) {
+      const Contact<dim>& c = contacts_[k];
+      if (c.p.n <= 0) continue;
+      const Vec<dim> p = impulse_vector<dim>(c.n, c.p.n, c.p.t);
+      note(c.i, -p), note(c.j, p);
+    }
+  for (const WallContact<dim>& c : wall_contacts_)
+    if (c.p.n > 0) note(c.j, impulse_vector<dim>(c.n, c.p.n, c.p.t));
 }
 
 template <int dim>

@@ -39,9 +39,13 @@ struct alignas(32) Pack {
 };
 static_assert(sizeof(Pack) == 256);
 
-struct alignas(32) PackBias {
-  Lanes t;  // tangential restitution, see Problem::bias_t
+struct alignas(32) PackGeneral {  // General of each lane
+  Lanes bias_t, ratio_i, ratio_j, rolling;
 };
+
+inline void put(PackGeneral& pack, int lane, const General<2>& g) {
+  pack.bias_t[lane] = g.bias_t, pack.ratio_i[lane] = g.ratio_i, pack.ratio_j[lane] = g.ratio_j, pack.rolling[lane] = g.rolling;
+}
 
 inline void put(Pack& pack, int lane, const Contact<2>& c) {
   pack.n_x[lane] = c.n.x(), pack.n_y[lane] = c.n.y();
@@ -91,31 +95,35 @@ inline bool any_of(const int* flags, const Pack& pack) {
 template <Law law>
 struct WideSlip {
   Lanes n, t{};
-  [[gnu::always_inline]] WideSlip(const Quad& a, const Quad& b, const Pack& c, const Lanes* bias_t) {
+  [[gnu::always_inline]] WideSlip(const Quad& a, const Quad& b, const Pack& c, const PackGeneral* general) {
     const Lanes u_x = b.a - a.a, u_y = b.b - a.b;
     n = u_x * c.n_x + u_y * c.n_y + c.bias;
     if constexpr (law != Law::frictionless) t = c.n_x * u_y - c.n_y * u_x - (a.c + b.c);
-    if constexpr (law == Law::coulomb_restitution) t += *bias_t;
+    if constexpr (law == Law::general) t += general->bias_t;
   }
   bool open(const Pack& c) const { return !any((c.p.n != 0.0) | (n < 0.0)); }  // and stays open
 };
 
+// general: of the pack where that is the law, else not read.
 template <Law law>
-[[gnu::always_inline]] inline Change<Lanes> update(Pack& c, Body<2>* bodies, const Lanes* bias_t, double spin_ratio, double omega) {
+[[gnu::always_inline]] inline Change<Lanes> update(Pack& c, Body<2>* bodies, const PackGeneral* general, double spin_ratio, double omega) {
   Quad a = load(bodies, c.i), b = load(bodies, c.j);  // .a = v_x, .b = v_y, .c = s, .d = 1/m
-  const WideSlip<law> u(a, b, c, bias_t);
+  const WideSlip<law> u(a, b, c, general);
   if (u.open(c)) return {};
   Impulse<2, Lanes> next;
   const Lanes step = omega * c.inv_w;
   if constexpr (law == Law::frictionless)
     next.n = positive<Lanes>(c.p.n - step * u.n);
+  else if constexpr (law == Law::general)
+    next = obey_coulomb<2, Lanes>(c.p, u.n, u.t, step, step * general->rolling, c.friction);
   else
     next = obey_coulomb<2, Lanes>(c.p, u.n, u.t, step, step * (1.0 / (1.0 + spin_ratio)), c.friction);
   const Lanes d_n = next.n - c.p.n, d_t = next.t - c.p.t;
   const Lanes p_x = d_n * c.n_x - d_t * c.n_y, p_y = d_n * c.n_y + d_t * c.n_x;
   a.a -= a.d * p_x, a.b -= a.d * p_y;
   b.a += b.d * p_x, b.b += b.d * p_y;
-  if constexpr (law != Law::frictionless) a.c -= a.d * (spin_ratio * d_t), b.c -= b.d * (spin_ratio * d_t);
+  if constexpr (law == Law::coulomb) a.c -= a.d * (spin_ratio * d_t), b.c -= b.d * (spin_ratio * d_t);
+  if constexpr (law == Law::general) a.c -= a.d * (general->ratio_i * d_t), b.c -= b.d * (general->ratio_j * d_t);
   store(bodies, c.i, a);
   store(bodies, c.j, b);
   c.p = next;
@@ -124,9 +132,9 @@ template <Law law>
 }
 
 template <Law law>
-inline Change<Lanes> error(const Pack& c, Body<2>* bodies, const Lanes* bias_t) {
+inline Change<Lanes> error(const Pack& c, Body<2>* bodies, const PackGeneral* general) {
   const Quad a = load(bodies, c.i), b = load(bodies, c.j);
-  const WideSlip<law> u(a, b, c, bias_t);
+  const WideSlip<law> u(a, b, c, general);
   if (u.open(c)) return {};
   const Lanes w = a.d + b.d, change = w * natural_map<2, Lanes>(c.p, u.n, u.t, c.inv_w, c.friction);
   return {change, w * (c.p.n * c.p.n + c.p.t * c.p.t), w * change};

@@ -103,7 +103,7 @@ std::pair<DelassusProblem<dim>, Eigen::VectorXd> delassus(const Problem<dim>& pr
       const double sign = end == 0 ? -1.0 : 1.0;
       if (body >= 0) {
         for (const End& other : of_body[body])
-          add(other.contact, coupling<dim>(frame[c], frame[other.contact], sign * other.sign, problem.bodies[body].inv_m, problem.spin_ratio));
+          add(other.contact, coupling<dim>(frame[c], frame[other.contact], sign * other.sign, problem.bodies[body].inv_m, problem.spin_ratio_of(body)));
       } else {
         for (const End& other : of_wall[-1 - body])
           add(other.contact, frame[c].transpose() * problem.walls[-1 - body].inv_m.asDiagonal() * frame[other.contact]);
@@ -140,9 +140,9 @@ SolveReport solve_newton(Problem<dim>& problem, const SolverSettings& settings) 
     else next.t = r_c[1] * frame.col(1) + r_c[2] * frame.col(2);
     const Impulse<dim> change{next.n - c.p.n, next.t - c.p.t};
     if constexpr (requires { c.wall; })
-      push<Law::coulomb>(problem.walls[c.wall], problem.bodies[c.j], c.n, change.n, change.t, problem.spin_ratio);
+      push<Law::coulomb>(problem.walls[c.wall], problem.bodies[c.j], c.n, change.n, change.t, 0.0, problem.spin_ratio_of(c.j));
     else
-      push<Law::coulomb>(problem.bodies[c.i], problem.bodies[c.j], c.n, change.n, change.t, problem.spin_ratio);
+      push<Law::coulomb>(problem.bodies[c.i], problem.bodies[c.j], c.n, change.n, change.t, problem.spin_ratio_of(c.i), problem.spin_ratio_of(c.j));
     c.p = next;
   });
   SolveReport report;
