@@ -307,6 +307,35 @@ void Neighbours<dim>::find(Grains<dim>& grains, std::vector<Wall<dim>>& walls, c
 }
 
 template <int dim>
+void Neighbours<dim>::remove(std::span<const int> new_of_old) {
+  int at = 0;
+  for (Block& block : blocks) {
+    const int begin = at;
+    for (int k = block.begin; k < block.end; ++k) {
+      Pair<dim> pair = pairs[k];
+      pair.i = new_of_old[pair.i], pair.j = new_of_old[pair.j];
+      if (pair.i >= 0 && pair.j >= 0) pairs[at++] = pair;
+    }
+    block = {begin, at};
+  }
+  pairs.resize(at);
+  for (WallPair<dim>& pair : wall_pairs) {
+    pair.j = new_of_old[pair.j];
+    if (pair.fixed >= 0) pair.fixed = new_of_old[pair.fixed];
+  }
+  std::erase_if(wall_pairs, [](const WallPair<dim>& pair) { return pair.j < 0; });
+  // Cells lose grains, but what was found of them still bounds the others.
+  const int n = static_cast<int>(x_found_.size());
+  std::vector<int> kept(n + 1, 0);  // of the first so many
+  for (int i = 0; i < n; ++i) {
+    kept[i + 1] = kept[i] + (new_of_old[i] >= 0);
+    if (new_of_old[i] >= 0) x_found_[new_of_old[i]] = x_found_[i];
+  }
+  x_found_.resize(kept[n]);
+  for (int& start : cell_start_) start = kept[start];
+}
+
+template <int dim>
 bool Neighbours<dim>::valid(const Grains<dim>& grains, const std::vector<Wall<dim>>& walls, double reach, double h,
                             int threads) {
   if (grains.size() == 0) return true;

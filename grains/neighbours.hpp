@@ -56,6 +56,9 @@ class Neighbours {
   // a bound, never an estimate.
   bool valid(const Grains<dim>& grains, const std::vector<Wall<dim>>& walls, double reach, double h, int threads);
 
+  // Some grains have left, the others closed up in their order: what is known of these stays. -1 in the place of a grain that left.
+  void remove(std::span<const int> new_of_old);
+
   template <class Archive>
   void visit_state(Archive&& archive);  // state.cpp
 

@@ -243,6 +243,23 @@ void bind(py::module_& m, const char* suffix) {
            "velocity : (n, dim) [m/s], optional\nspin : (n,) in 2D, (n, 3) in 3D [rad/s], optional\nmaterial : str\n\n"
            "Returns\n-------\n(first, last + 1) : ids of the new grains\n\nRaises\n------\nValueError : a radius <= 0, values that are "
            "not finite, an unknown material, a period below four diameters")
+      .def("remove",
+           [](Sim& s, const py::object& object) {
+             const auto ids = py::array::ensure(object);
+             if (!ids) throw py::type_error(fmt::format("remove: ids must be integers of shape (n,), got {}", std::string(py::repr(object))));
+             if (ids.ndim() != 1 || (ids.size() > 0 && ids.dtype().kind() != 'i'))  // as integers, a mask would name grains 0 and 1
+               fail("remove: ids must be integers of shape (n,), got {} of {} dimensions", std::string(py::str(ids.dtype())), ids.ndim());
+             const auto values = py::array_t<std::int64_t, py::array::c_style | py::array::forcecast>(ids);
+             std::vector<int> narrow;
+             for (py::ssize_t k = 0; k < values.size(); ++k) {
+               if (values.at(k) < 0 || values.at(k) >= s.count()) fail("remove: no grain {}, the scene has {}", values.at(k), s.count());
+               narrow.push_back(static_cast<int>(values.at(k)));
+             }
+             s.remove(narrow);
+           },
+           "ids"_a,
+           "Take grains out of the scene, (n,) int. The ids of the others close up, in their order, and their contacts keep their impulses.\n\n"
+           "Raises\n------\nValueError : an id that no grain has, or twice the same; nothing is changed then")
       .def("add_plane",
            [](const py::object& self, const Array& point, const Array& normal, const std::string& material,
               const PerAxis& velocity, const PerAxis& load, std::optional<double> mass) {

@@ -111,6 +111,57 @@ int Simulation<dim>::add(std::span<const Vec<dim>> x, std::span<const double> ra
 }
 
 template <int dim>
+void Simulation<dim>::remove(std::span<const int> ids) {
+  std::vector<int> id_of(n_free_, 0);  // by old id; -1: leaves
+  for (const int id : ids) {
+    if (id < 0 || id >= n_free_) fail("remove: no grain {}, the scene has {}", id, n_free_);
+    if (id_of[id] < 0) fail("remove: grain {} is named twice", id);
+    id_of[id] = -1;
+  }
+  const std::vector<int> left(id_of);
+  auto keep_ids = [&](auto& by_id) {  // of an array by id
+    std::size_t at = 0;
+    for (std::size_t id = 0; id < by_id.size(); ++id)
+      if (left[id] == 0) by_id[at++] = by_id[id];
+    by_id.resize(at);
+  };
+  keep_ids(drag_.coefficient), keep_ids(drag_.velocity), keep_ids(drag_.impulse), keep_ids(drag_.contact_impulse), keep_ids(drag_.in_contact);
+  n_free_ = 0;
+  for (int& id : id_of)
+    if (id == 0) id = n_free_++;
+
+  const int n = grains_.size();
+  std::vector<int> new_of_old(n);
+  int stay = 0;
+  for (int k = 0; k < n; ++k) new_of_old[k] = grains_.id[k] >= 0 && left[grains_.id[k]] < 0 ? -1 : stay++;
+  auto keep = [&](auto& values) {
+    if (values.empty()) return;
+    for (int k = 0; k < n; ++k)
+      if (new_of_old[k] >= 0) values[new_of_old[k]] = values[k];
+    values.resize(stay);
+  };
+  keep(grains_.x), keep(grains_.body), keep(grains_.r), keep(grains_.id), keep(grains_.wall), keep(grains_.material), keep(grains_.force);
+  for (std::int32_t& id : grains_.id)
+    if (id >= 0) id = id_of[id];
+
+  const std::vector<Block> old(neighbours_.blocks);
+  neighbours_.remove(new_of_old);
+  for (std::size_t b = 0; b < count_.size(); ++b) {
+    const int begin = neighbours_.blocks[b].begin;
+    int at = begin;
+    for (int k = old[b].begin; k < old[b].begin + count_[b]; ++k) {
+      Contact<dim> c = contacts_[k];
+      c.i = new_of_old[c.i], c.j = new_of_old[c.j];
+      if (c.i >= 0 && c.j >= 0) contacts_[at++] = c;
+    }
+    count_[b] = at - begin;
+  }
+  for (WallContact<dim>& c : wall_contacts_) c.j = new_of_old[c.j];
+  std::erase_if(wall_contacts_, [](const WallContact<dim>& c) { return c.j < 0; });
+  contacts_current_ = false;
+}
+
+template <int dim>
 int Simulation<dim>::add_plane(const Vec<dim>& point, const Vec<dim>& normal, const std::string& material) {
   const std::string got = fmt::format("{}", fmt::join(normal, ", "));
   if (!is_finite(point.norm())) fail("add_plane: point [m] must be finite, got ({})", fmt::join(point, ", "));

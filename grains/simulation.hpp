@@ -82,6 +82,7 @@ class Simulation {
           std::span<const Spin<dim>> omega, const std::string& material);
   int add_plane(const Vec<dim>& point, const Vec<dim>& normal, const std::string& material);
   int add_segment(const Vec<dim>& start, const Vec<dim>& end, const std::string& material);
+  void remove(std::span<const int> ids);  // the ids of the others close up, in their order; their contacts keep their impulses
   void drive(int wall, int axis, double velocity);                                // [m/s]
   void set_load(int wall, int axis, double force, std::optional<double> mass);    // [N], [kg]
   void attach(int wall, std::span<const Vec<dim>> x, std::span<const double> radius, const std::string& material);
