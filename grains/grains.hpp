@@ -18,7 +18,7 @@ struct Grains {
   std::vector<Body<dim>> body;        // velocity, spin, inverse mass
   std::vector<double> r;              // radius [m]
   std::vector<std::int32_t> id;       // order of adding, >= 0; grains fixed to a wall: -1, -2, ...
-  std::vector<std::int16_t> wall;     // wall that carries this grain; -1: free
+  std::vector<std::int32_t> wall;     // wall that carries this grain; -1: free
   std::vector<std::uint8_t> material;
   std::vector<Vec<dim>> force;        // external force [N] (2D: N/m); empty when there is none
   double inertia = Rotation<dim>::inertia;  // I/(m r^2) of every grain [-]
@@ -29,11 +29,12 @@ struct Grains {
 // A rigid body that does not turn. Along each axis either its velocity is given (inv_m = 0) or its load (inv_m > 0).
 template <int dim>
 struct Wall {
-  enum class Shape { plane, segment };
+  enum class Shape { plane, segment, triangle };  // segments in 2D, triangles in 3D: facets
   Shape shape = Shape::plane;
-  Vec<dim> point = Vec<dim>::Zero();   // a point of the plane, or the segment's start [m]
-  Vec<dim> normal = Vec<dim>::Zero();  // unit; the grains are on its side. Plane only: a segment is met from both sides
-  Vec<dim> span = Vec<dim>::Zero();    // end - start of a segment [m]
+  Vec<dim> point = Vec<dim>::Zero();   // a point of the plane, or the facet's first corner [m]
+  Vec<dim> normal = Vec<dim>::Zero();  // unit; of a plane towards the grains, of a facet either: it is met from both sides
+  Vec<dim> span = Vec<dim>::Zero();    // from the facet's first corner to its second [m]
+  Vec<dim> side = Vec<dim>::Zero();    // from the triangle's first corner to its third [m]
   Vec<dim> v = Vec<dim>::Zero();       // velocity [m/s]
   Vec<dim> inv_m = Vec<dim>::Zero();   // inverse mass per axis [1/kg] (2D: m/kg); 0: driven by velocity
   Vec<dim> load = Vec<dim>::Zero();    // external force on load-driven axes [N] (2D: N/m)
@@ -42,6 +43,12 @@ struct Wall {
   std::uint8_t material = 0;
   Vec<dim> force = Vec<dim>::Zero();   // mean contact force on the wall over the last step [N] (2D: N/m)
   Vec<dim> moved = Vec<dim>::Zero();   // way since neighbours were last found [m]
+
+  bool is_facet() const { return shape != Shape::plane; }
+  Vec<dim> middle() const {
+    if (shape == Shape::triangle) return point + (span + side) / 3;
+    return point + 0.5 * span;
+  }
 };
 
 // Friction and restitution for every pair of materials. Restitution: u_n+ = -normal u_n-, u_t+ = -tangential u_t-.
@@ -95,17 +102,39 @@ struct NearWall {
   double distance;
 };
 
+// From a triangle's first corner to its point nearest to x, x seen from that corner; whether it is neither on an edge nor a corner.
+// C. Ericson, Real-Time Collision Detection (2005), section 5.1.5.
+inline std::pair<Vec<3>, bool> nearest_in_triangle(const Vec<3>& x, const Vec<3>& span, const Vec<3>& side) {
+  const double a_1 = span.dot(x), a_2 = side.dot(x);
+  if (a_1 <= 0 && a_2 <= 0) return {Vec<3>::Zero(), false};
+  const double b_1 = a_1 - span.squaredNorm(), b_2 = a_2 - side.dot(span);
+  if (b_1 >= 0 && b_2 <= b_1) return {span, false};
+  const double c_1 = a_1 - span.dot(side), c_2 = a_2 - side.squaredNorm();
+  if (c_2 >= 0 && c_1 <= c_2) return {side, false};
+  const double on_side = c_1 * a_2 - a_1 * c_2, on_span = a_1 * b_2 - b_1 * a_2, opposite = b_1 * c_2 - c_1 * b_2;
+  if (on_span <= 0 && a_1 >= 0 && b_1 <= 0) return {a_1 / (a_1 - b_1) * span, false};
+  if (on_side <= 0 && a_2 >= 0 && c_2 <= 0) return {a_2 / (a_2 - c_2) * side, false};
+  if (opposite <= 0 && b_2 >= b_1 && c_1 >= c_2) return {span + (b_2 - b_1) / ((b_2 - b_1) + (c_1 - c_2)) * (side - span), false};
+  return {(on_side * span + on_span * side) / (on_side + on_span + opposite), true};
+}
+
 template <int dim>
 NearWall<dim> nearest_point(const Wall<dim>& wall, const Vec<dim>& x, const Box<dim>& box) {
   if (wall.shape == Wall<dim>::Shape::plane) return {wall.normal, (x - wall.point).dot(wall.normal)};
-  const Vec<dim> from_middle = box.nearest(x - wall.point - 0.5 * wall.span);
+  const Vec<dim> from_middle = box.nearest(x - wall.middle());
+  if constexpr (dim == 3) {
+    const Vec<3> from_corner = from_middle + (wall.span + wall.side) / 3;
+    const auto [nearest, inside] = nearest_in_triangle(from_corner, wall.span, wall.side);
+    const Vec<3> away = from_corner - nearest;
+    const double across = from_corner.dot(wall.normal), distance = inside ? std::abs(across) : away.norm();
+    if (inside || distance == 0) return {across < 0 ? Vec<3>(-wall.normal) : wall.normal, distance};
+    return {away / distance, distance};
+  }
   const double along = std::clamp(from_middle.dot(wall.span) / wall.span.squaredNorm(), -0.5, 0.5);
   const Vec<dim> away = from_middle - along * wall.span;
   const double distance = away.norm();
   if (distance > 0) return {away / distance, distance};
-  Vec<dim> n = Vec<dim>::Zero();  // a centre exactly on the segment: either side will do
-  n[0] = -wall.span[1], n[1] = wall.span[0];
-  return {n.normalized(), 0.0};
+  return {wall.normal, 0.0};  // a centre exactly on the segment: either side will do
 }
 
 }  // namespace quicksand

@@ -129,7 +129,7 @@ std::array<int, dim> CloseGrains<dim>::own_cell(const Level& level, const Vec<di
 }
 
 template <int dim>
-void Neighbours<dim>::sort(Grains<dim>& grains, const Box<dim>& box) {
+typename Neighbours<dim>::Grid Neighbours<dim>::sort(Grains<dim>& grains, const Box<dim>& box) {
   const int n = grains.size();
   for (Vec<dim>& x : grains.x) x = box.wrap(x);
   double r_max = 0.0, r_mean = 0.0;
@@ -174,14 +174,91 @@ void Neighbours<dim>::sort(Grains<dim>& grains, const Box<dim>& box) {
   // valid() walks the cells in the order of `axes`
   std::array<int, dim> reordered;
   for (int k = 0; k < dim; ++k) reordered[k] = cells_[axes[k]], around_[k] = box.period[axes[k]] > 0;
+  const Grid grid{low, inv, cells_, axes};
   cells_ = reordered;
   x_found_ = grains.x;
+  return grid;
+}
+
+// Cells that the facet's bounding box, `margin` wider on every side, meets; those at the rim stand for what is outside.
+template <int dim>
+template <class Visit>
+void Neighbours<dim>::each_cell_near(const Wall<dim>& facet, const Box<dim>& box, const Grid& grid, double margin, Visit&& visit) const {
+  std::array<int, 3> first{0, 0, 0}, many{1, 1, 1};
+  for (int k = 0; k < dim; ++k) {
+    const auto [low, high] = std::minmax({0.0, facet.span[k], facet.side[k]});
+    auto cell_of = [&](double x) {  // far away is no number of a cell
+      return static_cast<int>(std::clamp(std::floor((x - grid.low[k]) * grid.inv_size[k]), -1e9, 1e9));
+    };
+    int begin = cell_of(facet.point[k] + low - margin), end = cell_of(facet.point[k] + high + margin);
+    if (box.period[k] == 0) begin = std::clamp(begin, 0, grid.cells[k] - 1), end = std::clamp(end, 0, grid.cells[k] - 1);
+    first[k] = begin, many[k] = std::min(end - begin + 1, grid.cells[k]);
+  }
+  for (int a = 0; a < many[0]; ++a)
+    for (int b = 0; b < many[1]; ++b)
+      for (int c = 0; c < many[2]; ++c) {
+        const std::array<int, 3> step{a, b, c};
+        int cell = 0;
+        for (int k : grid.axes) {
+          const int n = grid.cells[k];
+          cell = cell * n + ((first[k] + step[k]) % n + n) % n;
+        }
+        visit(cell);
+      }
+}
+
+// A facet k cells away from a grain's is at least k - 1 cells away from the grain.
+template <int dim>
+void Neighbours<dim>::measure_facets(const std::vector<Wall<dim>>& walls, const Box<dim>& box, const Grid& grid, double r_max) {
+  const int n_cells = static_cast<int>(cell_start_.size()) - 1;
+  double size = std::numeric_limits<double>::infinity();
+  for (int k = 0; k < dim; ++k)
+    if (grid.cells[k] > 1) size = std::min(size, 1 / grid.inv_size[k]);
+  std::vector<int> away(n_cells, -1), reached;
+  auto reach = [&](int cell, int cells_away) {
+    if (away[cell] < 0) away[cell] = cells_away, reached.push_back(cell);
+  };
+  for (const Wall<dim>& wall : walls)
+    if (wall.is_facet()) each_cell_near(wall, box, grid, 0.0, [&](int cell) { reach(cell, 0); });
+  for (std::size_t k = 0; k < reached.size(); ++k)
+    each_cell_beside(reached[k], [&](int other) { reach(other, away[reached[k]] + 1); });
+  cell_facet_gap_.resize(n_cells);
+  for (int c = 0; c < n_cells; ++c)
+    cell_facet_gap_[c] = away[c] < 0 ? std::numeric_limits<double>::infinity()
+                                     : std::max(2 * skin_, away[c] > 1 ? (away[c] - 1) * size - r_max : 0.0);
+}
+
+// Neighbouring cells, twice where a period has two cells.
+template <int dim>
+template <class Visit>
+void Neighbours<dim>::each_cell_beside(int cell, Visit&& visit) const {
+  std::array<int, 3> at{0, 0, 0}, n{1, 1, 1};
+  for (int k = dim - 1, rest = cell; k >= 0; --k) n[k] = cells_[k], at[k] = rest % n[k], rest /= n[k];
+  for (int code = 0; code <= shift_back<dim>(0); ++code) {
+    int other = 0;
+    bool outside = false;
+    for (int k = 0, f = dim == 2 ? 3 : 9; k < dim; ++k, f /= 3) {
+      int a = at[k] + code / f % 3 - 1;
+      if (around_[k]) a = (a + n[k]) % n[k];
+      outside |= a < 0 || a >= n[k];
+      other = other * n[k] + a;
+    }
+    if (!outside && other != cell) visit(other);
+  }
 }
 
 template <int dim>
-void Neighbours<dim>::list(const Grains<dim>& grains, const std::vector<Wall<dim>>& walls, const Box<dim>& box,
+void Neighbours<dim>::list(const Grains<dim>& grains, const std::vector<Wall<dim>>& walls, const Box<dim>& box, const Grid& grid,
                            int threads) {
-  const int n = grains.size();
+  const int n = grains.size(), n_cells = static_cast<int>(cell_start_.size()) - 1, n_walls = static_cast<int>(walls.size());
+  const double r_max = n > 0 ? *std::max_element(grains.r.begin(), grains.r.end()) : 0.0;
+  std::vector<int> planes, cells, walls_in_cell, wall_start;  // planes are near every cell
+  for (int w = 0; w < n_walls; ++w) {
+    if (walls[w].is_facet()) each_cell_near(walls[w], box, grid, 2 * skin_ + r_max, [&](int c) { cells.push_back(c), walls_in_cell.push_back(w); });
+    else planes.push_back(w);
+  }
+  std::vector<int> in_order = sort_by_key(cells, n_cells, wall_start);
+  for (int& k : in_order) k = walls_in_cell[k];
   const CloseGrains<dim> close(grains.x, grains.r, box, 1.0, skin_);
   const int n_blocks = (n + block_size - 1) / block_size;
   found_in_block_.resize(n_blocks);
@@ -190,6 +267,8 @@ void Neighbours<dim>::list(const Grains<dim>& grains, const std::vector<Wall<dim
     Found& found = found_in_block_[b];
     found.pairs.clear();
     found.wall_pairs.clear();
+    std::vector<int> near;  // walls that grains of the cell may be near, in their order
+    int cell = -1;
     for (int i = b * block_size; i < std::min(n, (b + 1) * block_size); ++i) {
       close.visit(i, [&](int a, int c, int code) {
         if (grains.wall[a] >= 0 && grains.wall[c] >= 0) return;
@@ -200,24 +279,30 @@ void Neighbours<dim>::list(const Grains<dim>& grains, const std::vector<Wall<dim
           found.pairs.push_back({a, c, code, {}});
       });
       if (grains.wall[i] >= 0) continue;
-      for (std::size_t w = 0; w < walls.size(); ++w)
+      if (cell < 0 || i >= cell_start_[cell + 1]) {
+        cell = static_cast<int>(std::upper_bound(cell_start_.begin(), cell_start_.end(), i) - cell_start_.begin()) - 1;
+        near = planes;
+        near.insert(near.end(), in_order.begin() + wall_start[cell], in_order.begin() + wall_start[cell + 1]);
+        std::sort(near.begin(), near.end());
+      }
+      for (const int w : near)
         if (nearest_point(walls[w], grains.x[i], box).distance - grains.r[i] < 2 * skin_)
-          found.wall_pairs.push_back({static_cast<int>(w), -1, i, shift_back<dim>(0) / 2, {}});
+          found.wall_pairs.push_back({w, -1, i, shift_back<dim>(0) / 2, {}});
     }
   }
   // What valid() needs to know of the grains that are not listed with a wall
-  const int n_cells = static_cast<int>(cell_start_.size()) - 1;
-  cell_wall_gap_.assign(walls.size() * n_cells, 0.0);
-  for (std::size_t w = 0; w < walls.size(); ++w)
+  measure_facets(walls, box, grid, r_max);
+  cell_wall_gap_.assign(planes.size() * n_cells, 0.0);
+  for (std::size_t p = 0; p < planes.size(); ++p)
 #pragma omp parallel for num_threads(threads) schedule(static)
     for (int c = 0; c < n_cells; ++c) {
       double gap = std::numeric_limits<double>::infinity();
       for (int i = cell_start_[c]; i < cell_start_[c + 1]; ++i) {
         if (grains.wall[i] >= 0) continue;
-        const double g = nearest_point(walls[w], grains.x[i], box).distance - grains.r[i];
+        const double g = nearest_point(walls[planes[p]], grains.x[i], box).distance - grains.r[i];
         if (g >= 2 * skin_) gap = std::min(gap, g);
       }
-      cell_wall_gap_[w * n_cells + c] = gap;
+      cell_wall_gap_[p * n_cells + c] = gap;
     }
 }
 
@@ -281,7 +366,7 @@ void Neighbours<dim>::find(Grains<dim>& grains, std::vector<Wall<dim>>& walls, c
   for (Wall<dim>& wall : walls) wall.moved.setZero();
   const int n = grains.size();
 
-  sort(grains, box);
+  const Grid grid = sort(grains, box);
   auto renumber = [&](int i) { return i < 0 ? i : new_of_old_[i]; };
   const Known<dim, Pair<dim>> known(pairs, n, [&](Pair<dim>& old) {
     old.i = renumber(old.i), old.j = renumber(old.j);
@@ -291,7 +376,7 @@ void Neighbours<dim>::find(Grains<dim>& grains, std::vector<Wall<dim>>& walls, c
     old.fixed = renumber(old.fixed), old.j = renumber(old.j);
     return old.j;
   });
-  list(grains, walls, box, threads);
+  list(grains, walls, box, grid, threads);
   arrange(n, threads);
 #pragma omp parallel for num_threads(threads) schedule(static)
   for (std::size_t k = 0; k < pairs.size(); ++k)
@@ -361,28 +446,12 @@ bool Neighbours<dim>::within(const Grains<dim>& grains, const std::vector<Wall<d
     cell_mean_[c] = mean;
     cell_spread_[c] = std::sqrt(spread2);
   }
-  // Neighbouring cells c < other, each once (twice where a period has two cells)
-  auto for_neighbours = [&](int c, auto&& visit) {
-    std::array<int, 3> at{0, 0, 0}, n{1, 1, 1};
-    for (int k = dim - 1, rest = c; k >= 0; --k) n[k] = cells_[k], at[k] = rest % n[k], rest /= n[k];
-    for (int code = 0; code <= shift_back<dim>(0); ++code) {
-      int other = 0;
-      bool outside = false;
-      for (int k = 0, f = dim == 2 ? 3 : 9; k < dim; ++k, f /= 3) {
-        int a = at[k] + code / f % 3 - 1;
-        if (around_[k]) a = (a + n[k]) % n[k];
-        outside |= a < 0 || a >= n[k];
-        other = other * n[k] + a;
-      }
-      if (!outside && other != c) visit(other);
-    }
-  };
   // An empty cell may carry any value (the bound is a chain through neighbouring cells): its neighbours' mean costs least.
   for (int c = 0; c < n_cells; ++c) {
     if (cell_start_[c] != cell_start_[c + 1]) continue;
     Vec<dim> mean = Vec<dim>::Zero();
     int n = 0;
-    for_neighbours(c, [&](int other) {
+    each_cell_beside(c, [&](int other) {
       if (cell_start_[other] != cell_start_[other + 1]) mean += cell_mean_[other], ++n;
     });
     if (n > 0) cell_mean_[c] = mean / n;
@@ -391,19 +460,26 @@ bool Neighbours<dim>::within(const Grains<dim>& grains, const std::vector<Wall<d
 #pragma omp parallel for num_threads(threads) schedule(static) reduction(max : nearing)
   for (int c = 0; c < n_cells; ++c) {
     nearing = std::max(nearing, 2 * cell_spread_[c]);
-    for_neighbours(c, [&](int other) {
+    each_cell_beside(c, [&](int other) {
       if (other < c) return;
       nearing = std::max(nearing, cell_spread_[c] + cell_spread_[other] + (cell_mean_[c] - cell_mean_[other]).norm());
     });
   }
   if (nearing + reach > skin_) return false;
-  for (std::size_t w = 0; w < walls.size(); ++w)
-    for (int c = 0; c < n_cells; ++c) {
-      if (cell_start_[c] == cell_start_[c + 1]) continue;
-      const Vec<dim> way = cell_mean_[c] - walls[w].moved - h * walls[w].v;
-      const double towards = walls[w].shape == Wall<dim>::Shape::plane ? -way.dot(walls[w].normal) : way.norm();
-      if (towards + cell_spread_[c] + reach > cell_wall_gap_[w * n_cells + c]) return false;
+  std::vector<Vec<dim>> facet_ways;  // many facets move as one
+  const double* gap = cell_wall_gap_.data();
+  for (const Wall<dim>& wall : walls) {
+    const Vec<dim> wall_way = wall.moved + h * wall.v;
+    if (wall.is_facet()) {
+      if (std::find(facet_ways.begin(), facet_ways.end(), wall_way) == facet_ways.end()) facet_ways.push_back(wall_way);
+      continue;
     }
+    for (int c = 0; c < n_cells; ++c, ++gap)
+      if (cell_start_[c] != cell_start_[c + 1] && cell_spread_[c] + reach - (cell_mean_[c] - wall_way).dot(wall.normal) > *gap) return false;
+  }
+  for (const Vec<dim>& facet_way : facet_ways)
+    for (int c = 0; c < n_cells; ++c)
+      if (cell_start_[c] != cell_start_[c + 1] && (cell_mean_[c] - facet_way).norm() + cell_spread_[c] + reach > cell_facet_gap_[c]) return false;
   return true;
 }
 

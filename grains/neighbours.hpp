@@ -1,6 +1,7 @@
 // Which grains and walls may touch before neighbours are found again, in an order that several threads can sweep.
 //
 // Detection uses one grid per size class (radii within a factor of two), so that the cost per grain does not depend on d_max/d_min.
+// Walls are looked for in the cells that the order comes from: the cost per grain does not depend on how many facets there are.
 // The list holds every pair nearer than `skin`; it stays valid as long as the motion of grains relative to their surroundings,
 // not their motion through space, cannot have brought an unlisted pair nearer than the distance asked for.
 //
@@ -27,7 +28,7 @@ struct Pair {
 template <int dim>
 struct WallPair {
   int wall;
-  int fixed;  // the grain fixed to the wall that j may touch; -1: the wall's plane or segment itself
+  int fixed;  // the grain fixed to the wall that j may touch; -1: the wall's plane or facet itself
   int j;
   int shift;
   Impulse<dim> p;
@@ -65,8 +66,17 @@ class Neighbours {
   void forget() { skin_ = -1.0; }  // grains or walls were added or moved from outside
 
  private:
-  void sort(Grains<dim>& grains, const Box<dim>& box);
-  void list(const Grains<dim>& grains, const std::vector<Wall<dim>>& walls, const Box<dim>& box, int threads);
+  struct Grid {  // cells, numbered with the first of `axes` slowest
+    Vec<dim> low, inv_size;
+    std::array<int, dim> cells, axes;
+  };
+  Grid sort(Grains<dim>& grains, const Box<dim>& box);
+  void list(const Grains<dim>& grains, const std::vector<Wall<dim>>& walls, const Box<dim>& box, const Grid& grid, int threads);
+  void measure_facets(const std::vector<Wall<dim>>& walls, const Box<dim>& box, const Grid& grid, double r_max);
+  template <class Visit>
+  void each_cell_near(const Wall<dim>& facet, const Box<dim>& box, const Grid& grid, double margin, Visit&& visit) const;
+  template <class Visit>
+  void each_cell_beside(int cell, Visit&& visit) const;
   void arrange(int grains, int threads);
   bool within(const Grains<dim>& grains, const std::vector<Wall<dim>>& walls, double reach, double h, int threads);
 
@@ -84,7 +94,8 @@ class Neighbours {
   std::vector<int> cell_start_;
   std::vector<Vec<dim>> cell_mean_;     // mean way of a cell's grains [m]
   std::vector<double> cell_spread_;     // largest way of a grain relative to that mean [m]
-  std::vector<double> cell_wall_gap_;   // [wall][cell]: smallest gap of a grain not listed with the wall [m]
+  std::vector<double> cell_wall_gap_;   // [plane][cell]: smallest gap of a grain not listed with the plane [m]
+  std::vector<double> cell_facet_gap_;  // no grain of the cell has a smaller gap to a facet it is not listed with [m]
 };
 
 // Calls visit(i, j, shift code) for each pair with |x_j - x_i| < factor (r_i + r_j) + skin, once, i of the smaller size class.

@@ -106,6 +106,46 @@ WallHandle<dim> add_driven(const py::object& self, const char* where, const PerA
   return {self, &simulation, number};
 }
 
+// Facets of the named boundaries of a mesh, known by its attributes only: grains are built and run without meshes.
+template <int dim>
+std::vector<int> add_boundaries(Simulation<dim>& simulation, const py::object& mesh, const std::vector<std::string>& names,
+                                const std::string& material, const PerAxis& velocity) {
+  for (const char* what : {"nodes", "facets", "boundary", "boundary_names"})
+    if (!py::hasattr(mesh, what))
+      throw py::type_error(fmt::format("walls: mesh must have nodes, facets, boundary and boundary_names, as those of quicksand.meshes, got {}",
+                                       std::string(py::repr(mesh))));
+  if (velocity && velocity->size() != dim) fail("walls: velocity needs one entry per axis ({}), None where held, got {}", dim, velocity->size());
+  for (int k = 0; k < dim && velocity; ++k)
+    if (const double v = (*velocity)[k].value_or(0.0); !is_finite(v)) fail("walls: velocity must be finite, got {} m/s (axis {})", v, k);
+  using Numbers = py::array_t<int, py::array::c_style | py::array::forcecast>;
+  const auto nodes_kept = mesh.attr("nodes").cast<Array>();
+  const auto nodes = as_span<Vec<dim>>(nodes_kept, "walls", "nodes of the mesh");
+  const auto facets = mesh.attr("facets").cast<Numbers>(), boundary = mesh.attr("boundary").cast<Numbers>();
+  const auto known = mesh.attr("boundary_names").cast<std::vector<std::string>>();
+  if (facets.ndim() != 2 || facets.shape(1) != dim || boundary.ndim() != 1 || boundary.shape(0) != facets.shape(0))
+    fail("walls: facets of the mesh must have shape (n, {}), boundary (n,)", dim);
+  std::vector<char> wanted(known.size(), false);
+  for (const std::string& name : names) {
+    const auto at = std::find(known.begin(), known.end(), name);
+    if (at == known.end()) fail("walls: the mesh has no boundary '{}', known: '{}'", name, fmt::join(known, "', '"));
+    wanted[at - known.begin()] = true;
+  }
+  std::vector<std::array<Vec<dim>, dim>> corners;
+  for (py::ssize_t f = 0; f < facets.shape(0); ++f) {
+    if (!wanted.at(boundary.at(f))) continue;
+    corners.emplace_back();
+    for (int k = 0; k < dim; ++k) {
+      const int node = facets.at(f, k);
+      if (node < 0 || node >= static_cast<int>(nodes.size())) fail("walls: no node {} in the mesh (facet {})", node, f);
+      corners.back()[k] = nodes[node];
+    }
+  }
+  const std::vector<int> numbers = simulation.add_facets(corners, material);
+  for (const int wall : numbers)
+    for (int k = 0; k < dim && velocity; ++k) simulation.drive(wall, k, (*velocity)[k].value_or(0.0));
+  return numbers;
+}
+
 constexpr std::array solver_names{"auto", "nlgs", "active_set", "accelerated", "newton"};  // in the order of Solver
 
 Solver solver_named(const std::string& name) {
@@ -271,6 +311,22 @@ void bind(py::module_& m, const char* suffix) {
            "Add a plane wall; the grains are on the side its normal points to.\n\n"
            "Each axis is driven by velocity [m/s], by load [N] (2D: N/m), or held (None in both). `mass` [kg] (2D: kg/m) is that of the\n"
            "load-driven axes; default: a tenth of the mass of the grains present at the first step (steady states do not depend on it).")
+      .def("walls", &add_boundaries<dim>, "mesh"_a, "names"_a, "material"_a = "wall", "velocity"_a = py::none(),
+           "Make walls of boundaries of a mesh: each of their facets, segments in 2D and triangles in 3D, met from both sides. A grain passes\n"
+           "from one to the next without noticing. Returns the list of their numbers, for wall(number).\n\n"
+           "Parameters\n----------\nmesh : of quicksand.meshes, or anything with its nodes, facets, boundary and boundary_names\n"
+           "names : list of str, boundaries\nmaterial : str\nvelocity : per axis [m/s], of all of them as one; None: held\n\n"
+           "Raises\n------\nValueError : a name that no boundary has, a mesh of another dimension, an unknown material; no wall is added then")
+      .def("wall", [](const py::object& self, int number) {
+             auto& s = self.cast<Sim&>();
+             if (number < 0 || number >= static_cast<int>(s.walls().size())) fail("wall: no wall {}, the scene has {}", number, s.walls().size());
+             return Handle{self, &s, number};
+           }, "number"_a, "The wall of that number.")
+      .def_property_readonly("wall_force", [](const Sim& s) {
+             std::vector<Vec<dim>> force;
+             for (const Wall<dim>& wall : s.walls()) force.push_back(wall.force);
+             return to_numpy(std::move(force));
+           }, "(walls, dim) contact force on each wall by number, mean over the last step [N] (2D: N/m)")
       .def("set_friction", &Sim::set_friction, "a"_a, "b"_a, "friction"_a,
            "Coulomb friction [-] between two materials; names the materials. Every pair that may touch must be set.")
       .def("set_restitution", &Sim::set_restitution, "a"_a, "b"_a, "normal"_a, "tangential"_a = 0.0,
@@ -453,6 +509,16 @@ PYBIND11_MODULE(_grains, m) {
       py::name("add_segment"), py::is_method(m.attr("Simulation2D")), "start"_a, "end"_a, "material"_a = "wall",
       "velocity"_a = py::none(), "load"_a = py::none(), "mass"_a = py::none(),
       "Add a straight wall between two points [m], met from both sides. Driven as add_plane.");
+  m.attr("Simulation3D").attr("add_triangle") = py::cpp_function(
+      [](const py::object& self, const Array& a, const Array& b, const Array& c, const std::string& material, const PerAxis& velocity,
+         const PerAxis& load, std::optional<double> mass) {
+        return add_driven<3>(self, "add_triangle", velocity, load, mass, [&](Simulation<3>& s) {
+          return s.add_triangle(as_vector<3>(a, "add_triangle", "a"), as_vector<3>(b, "add_triangle", "b"), as_vector<3>(c, "add_triangle", "c"), material);
+        });
+      },
+      py::name("add_triangle"), py::is_method(m.attr("Simulation3D")), "a"_a, "b"_a, "c"_a, "material"_a = "wall",
+      "velocity"_a = py::none(), "load"_a = py::none(), "mass"_a = py::none(),
+      "Add a triangle by its corners [m], met from both sides. Driven as add_plane.");
   m.attr("Simulation2D").attr("psi6") = py::cpp_function(
       &psi6, py::name("psi6"), py::is_method(m.attr("Simulation2D")), "low"_a, "high"_a,
       "Hexagonal order: mean over grains with low <= y <= high [m] of |mean exp(6 i theta)| over neighbours nearer than\n"

@@ -184,13 +184,51 @@ int Simulation<dim>::add_segment(const Vec<dim>& start, const Vec<dim>& end, con
   wall.shape = Wall<dim>::Shape::segment;
   wall.point = start;
   wall.span = end - start;
+  wall.normal[0] = -wall.span[1], wall.normal[1] = wall.span[0];
+  wall.normal.normalize();
   return add_wall(wall, material, "add_segment");
+}
+
+template <int dim>
+int Simulation<dim>::add_triangle(const Vec<dim>& a, const Vec<dim>& b, const Vec<dim>& c, const std::string& material) {
+  if constexpr (dim != 3) {
+    fail("add_triangle: triangles are walls of 3D scenes");
+  } else {
+    const std::string got = fmt::format("({}), ({}) and ({})", fmt::join(a, ", "), fmt::join(b, ", "), fmt::join(c, ", "));
+    if (!is_finite(a.norm()) || !is_finite(b.norm()) || !is_finite(c.norm())) fail("add_triangle: corners [m] must be finite, got {}", got);
+    Wall<dim> wall;
+    wall.shape = Wall<dim>::Shape::triangle;
+    wall.point = a, wall.span = b - a, wall.side = c - a;
+    const Vec<3> area = cross(wall.span, wall.side);
+    // Flatter than that its normal is no better than that of a line.
+    if (!(area.norm() > 1e-9 * std::max(wall.span.squaredNorm(), wall.side.squaredNorm()))) fail("add_triangle: corners [m] must not be on one line, got {}", got);
+    for (int k = 0; k < dim; ++k)
+      if (const auto [low, high] = std::minmax({a[k], b[k], c[k]}); box_.period[k] > 0 && high - low > 0.5 * box_.period[k])
+        fail("add_triangle: a triangle must be at most half a period long, got {} m of {} m (axis {})", high - low, box_.period[k], k);
+    wall.normal = area.normalized();
+    return add_wall(wall, material, "add_triangle");
+  }
+}
+
+template <int dim>
+std::vector<int> Simulation<dim>::add_facets(std::span<const std::array<Vec<dim>, dim>> facets, const std::string& material) {
+  const std::size_t first = walls_.size();
+  std::vector<int> numbers;
+  try {
+    for (const auto& corners : facets) {
+      if constexpr (dim == 2) numbers.push_back(add_segment(corners[0], corners[1], material));
+      else numbers.push_back(add_triangle(corners[0], corners[1], corners[2], material));
+    }
+  } catch (...) {
+    walls_.resize(first);
+    throw;
+  }
+  return numbers;
 }
 
 template <int dim>
 int Simulation<dim>::add_wall(Wall<dim>& wall, const std::string& material, const char* where) {
   wall.material = materials_.find(material, where);
-  if (walls_.size() == 32767) fail("{}: at most 32767 walls", where);  // Grains::wall is that wide
   walls_.push_back(wall);
   places_changed();
   return static_cast<int>(walls_.size()) - 1;
@@ -238,7 +276,7 @@ void Simulation<dim>::attach(int wall, std::span<const Vec<dim>> x, std::span<co
     grains_.body.push_back(body);
     grains_.r.push_back(radius[k]);
     grains_.id.push_back(-(++n_fixed_));
-    grains_.wall.push_back(static_cast<std::int16_t>(wall));
+    grains_.wall.push_back(wall);
     grains_.material.push_back(m);
   }
   if (!grains_.force.empty()) grains_.force.resize(grains_.x.size(), Vec<dim>::Zero());

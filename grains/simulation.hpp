@@ -83,6 +83,9 @@ class Simulation {
   int add_plane(const Vec<dim>& point, const Vec<dim>& normal, const std::string& material);
   int add_segment(const Vec<dim>& start, const Vec<dim>& end, const std::string& material);
   void remove(std::span<const int> ids);  // the ids of the others close up, in their order; their contacts keep their impulses
+  int add_triangle(const Vec<dim>& a, const Vec<dim>& b, const Vec<dim>& c, const std::string& material);
+  // A wall for each facet, by its corners: segments in 2D, triangles in 3D. All of them, or none where one cannot be.
+  std::vector<int> add_facets(std::span<const std::array<Vec<dim>, dim>> facets, const std::string& material);
   void drive(int wall, int axis, double velocity);                                // [m/s]
   void set_load(int wall, int axis, double force, std::optional<double> mass);    // [N], [kg]
   void attach(int wall, std::span<const Vec<dim>> x, std::span<const double> radius, const std::string& material);
@@ -160,6 +163,7 @@ class Simulation {
   double speed_of_missed(double h, double speed, double alert, double wall_alert) const;
   double sub_step_length(double left, double dt, const Motion& motion) const;
   void find_contacts(double h, double alert, double wall_alert);
+  void join_facets(double wall_alert);
   Problem<dim> problem();
   SolveReport solve_contacts(double h);
   bool rebound(double h);
@@ -205,6 +209,7 @@ class Simulation {
   double wall_mass_ = 0.0;  // of load-driven walls whose mass nobody gave: a tenth of the grains' [kg]
   bool friction_ = false, restitution_ = false, tangential_restitution_ = false;
   std::vector<double> gap_;
+  std::vector<Vec<dim>> wall_normal_;  // of wall pairs, from the wall to the grain
   std::vector<Contact<dim>> contacts_;
   std::vector<WallContact<dim>> wall_contacts_;
   std::vector<int> pair_of_;  // of each contact: where its impulse is kept between sub-steps

@@ -84,7 +84,7 @@ template <int dim>
 template <class Archive>
 void Neighbours<dim>::visit_state(Archive&& a) {
   a(pairs), a(wall_pairs), a(blocks), a(colours), a(shifts), a(found);
-  a(skin_), a(x_found_), a(cells_), a(around_), a(cell_start_), a(cell_mean_), a(cell_spread_), a(cell_wall_gap_);
+  a(skin_), a(x_found_), a(cells_), a(around_), a(cell_start_), a(cell_mean_), a(cell_spread_), a(cell_wall_gap_), a(cell_facet_gap_);
 }
 
 template <int dim>

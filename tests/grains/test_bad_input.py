@@ -369,6 +369,8 @@ def functions(scene):
     if dim == 2:
         table["add_segment"] = sim.add_segment, {"start": ((0, -0.02), VECTOR), "end": ((0.01, -0.02), VECTOR)} | wall
         table["psi6"] = sim.psi6, {"low": (0.0, Kind(NAN)), "high": (1.0, Kind(NAN))}
+    else:
+        table["add_triangle"] = sim.add_triangle, {"a": ((0, -0.02, 0), VECTOR), "b": ((0.01, -0.02, 0), VECTOR), "c": ((0, -0.02, 0.01), VECTOR)} | wall
     return table
 
 

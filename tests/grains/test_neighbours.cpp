@@ -35,14 +35,27 @@ struct Crowd {
       grains.wall.push_back(on_wall ? 0 : -1);
       grains.material.push_back(0);
     }
-    walls.resize(2);
+    walls.resize(dim);
     walls[0].point[1] = -0.09, walls[0].normal[1] = 1;
     walls[1].point[1] = 0.03;
-    if (dim == 2) {
+    if constexpr (dim == 2) {
       walls[1].shape = Wall<dim>::Shape::segment;
-      walls[1].span[0] = 0.07, walls[1].span[1] = 0.01;
+      walls[1].span = Vec<2>(0.07, 0.01);
+      walls[1].normal = Vec<2>(-0.01, 0.07).normalized();
     } else {
       walls[1].normal[1] = -1;
+      walls[2].shape = Wall<dim>::Shape::triangle;
+      walls[2].point = Vec<3>(0.03, -0.03, -0.02);  // its second corner is beyond the boundary at 0.05
+      walls[2].span = Vec<3>(0.04, 0.02, 0), walls[2].side = Vec<3>(0, 0.01, 0.04);
+      walls[2].normal = cross(walls[2].span, walls[2].side).normalized();
+    }
+    for (int f = 0; f < 20; ++f) {  // small facets, also where there are no grains
+      Wall<dim> facet;
+      facet.shape = dim == 2 ? Wall<dim>::Shape::segment : Wall<dim>::Shape::triangle;
+      facet.point = random_vector<dim>(random, 0.15), facet.span = random_vector<dim>(random, 0.01), facet.side = random_vector<dim>(random, 0.01);
+      if constexpr (dim == 2) facet.side.setZero(), facet.normal = Vec<2>(-facet.span[1], facet.span[0]).normalized();
+      else facet.normal = cross(facet.span, facet.side).normalized();
+      walls.push_back(facet);
     }
   }
   double gap(int i, int j) const { return box.nearest(grains.x[j] - grains.x[i]).norm() - grains.r[i] - grains.r[j]; }
@@ -120,16 +133,16 @@ TYPED_TEST(Detection, impulses_follow_their_pair_when_grains_are_sorted_anew) {
   auto mark = [&](int i, int j) { return 1.0 + 1000 * (1000 + crowd.grains.id[i]) + crowd.grains.id[j]; };
   for (Pair<dim>& pair : crowd.neighbours.pairs) pair.p.n = mark(pair.i, pair.j);
   for (WallPair<dim>& pair : crowd.neighbours.wall_pairs)
-    pair.p.n = pair.fixed >= 0 ? mark(pair.fixed, pair.j) : -1e7 * pair.wall + 1e8 + crowd.grains.id[pair.j];
+    pair.p.n = pair.fixed >= 0 ? mark(pair.fixed, pair.j) : 1e7 * pair.wall + 1e8 + crowd.grains.id[pair.j];
   const std::size_t pairs = crowd.neighbours.pairs.size(), wall_pairs = crowd.neighbours.wall_pairs.size();
   for (Vec<dim>& x : crowd.grains.x) x += in_plane<dim>(0.037, 0.0);  // through the boundary: another order
-  crowd.walls[1].point[0] += 0.037;
+  for (Wall<dim>& wall : crowd.walls) wall.point[0] += 0.037;
   crowd.neighbours.find(crowd.grains, crowd.walls, crowd.box, 0.3e-3, 1);
   ASSERT_EQ(crowd.neighbours.pairs.size(), pairs);
   ASSERT_EQ(crowd.neighbours.wall_pairs.size(), wall_pairs);
   for (const Pair<dim>& pair : crowd.neighbours.pairs) EXPECT_EQ(pair.p.n, mark(pair.i, pair.j));
   for (const WallPair<dim>& pair : crowd.neighbours.wall_pairs)
-    EXPECT_EQ(pair.p.n, pair.fixed >= 0 ? mark(pair.fixed, pair.j) : -1e7 * pair.wall + 1e8 + crowd.grains.id[pair.j]);
+    EXPECT_EQ(pair.p.n, pair.fixed >= 0 ? mark(pair.fixed, pair.j) : 1e7 * pair.wall + 1e8 + crowd.grains.id[pair.j]);
 }
 
 // Motions of every kind: together, sheared, at random, one grain across the scene, two crowds towards each other over empty space.
@@ -150,8 +163,9 @@ TYPED_TEST(Detection, the_list_is_never_trusted_while_an_unlisted_pair_is_nearer
     for (Vec<dim>& x : crowd.grains.x)
       x += together + shear * (x[1] / 0.1) + random_vector<dim>(random, noise) - Vec<dim>::Unit(1) * std::copysign(closing, x[1]);
     if (seed % 5 == 0) crowd.grains.x[random() % crowd.grains.size()] += random_vector<dim>(random, 0.05);
+    const Vec<dim> facet_way = together + random_vector<dim>(random, 0.5 * amplitude());  // those of a mesh move as one
     for (Wall<dim>& wall : crowd.walls) {
-      const Vec<dim> way = together + random_vector<dim>(random, 0.5 * amplitude());
+      const Vec<dim> way = wall.is_facet() ? facet_way : Vec<dim>(together + random_vector<dim>(random, 0.5 * amplitude()));
       wall.point += way, wall.moved += way;
     }
     const bool valid = crowd.neighbours.valid(crowd.grains, crowd.walls, reach, 0.0, 1);

@@ -1,4 +1,4 @@
-// Walls: driven and loaded, flat and rough, segments; and the stress between plates, which must add up to the load.
+// Walls: driven and loaded, flat and rough, segments and triangles, alone and side by side; and the stress between plates, which must add up to the load.
 #include "scenes.hpp"
 
 namespace quicksand::test {
@@ -181,6 +181,142 @@ TEST(Segments, a_smooth_disc_slides_round_the_end_of_a_segment_and_leaves_where_
   }
   EXPECT_NEAR(leaves_at, 2.0 / 3 + u0 * u0 / (3 * g * r), 0.01);
   EXPECT_LT(positions(sim)[0].y(), -r);  // past it
+}
+
+// --------------------------------------------------------------------------------------------------------------- facets
+
+// A line through `corners` in the plane of the first two axes, as segments; in 3D a strip of triangles on both sides of that plane.
+template <int dim>
+void add_line(Simulation<dim>& sim, const std::vector<Vec<2>>& corners) {
+  std::vector<std::array<Vec<dim>, dim>> facets;
+  for (std::size_t k = 0; k + 1 < corners.size(); ++k) {
+    const Vec<dim> a = in_plane<dim>(corners[k][0], corners[k][1]), b = in_plane<dim>(corners[k + 1][0], corners[k + 1][1]);
+    if constexpr (dim == 2) {
+      facets.push_back({a, b});
+    } else {
+      const Vec<3> side(0, 0, (corners[1] - corners[0]).norm());
+      for (int row = -4; row < 4; ++row) {
+        facets.push_back({a + row * side, b + row * side, b + (row + 1) * side});
+        facets.push_back({a + row * side, a + (row + 1) * side, b + (row + 1) * side});
+      }
+    }
+  }
+  sim.add_facets(facets, "wall");
+}
+
+std::vector<Vec<2>> flat(double from, double to, double size) {
+  std::vector<Vec<2>> corners;
+  for (int k = 0; k <= std::lround((to - from) / size); ++k) corners.emplace_back(from + k * size, 0.0);
+  return corners;
+}
+
+TEST(Triangles, are_nearest_at_a_face_an_edge_or_a_corner) {
+  auto sim = scene<3>(0.3);
+  sim.add_triangle(Vec<3>(0, 0, 0), Vec<3>(2, 0, 0), Vec<3>(0, 1, 0), "wall");
+  const Wall<3>& wall = sim.walls()[0];
+  auto expect = [&](const Vec<3>& x, const Vec<3>& nearest) {
+    const NearWall<3> near = nearest_point(wall, x, sim.box());
+    EXPECT_NEAR(near.distance, (x - nearest).norm(), 1e-15);
+    EXPECT_LT((x - near.distance * near.n - nearest).norm(), 1e-15);
+  };
+  for (const double z : {0.5, -0.5, 1e-9}) {
+    expect({0.5, 0.25, z}, {0.5, 0.25, 0});   // face
+    expect({1.0, -0.3, z}, {1.0, 0, 0});      // edges
+    expect({-0.3, 0.4, z}, {0, 0.4, 0});
+    expect({1.2, 0.9, z}, {1, 0.5, 0});
+    expect({-1, -2, z}, {0, 0, 0});           // corners
+    expect({3, 0.5, z}, {2, 0, 0});
+    expect({-0.1, 1.5, z}, {0, 1, 0});
+  }
+  EXPECT_EQ(std::abs(nearest_point(wall, Vec<3>(0.5, 0.25, 0), sim.box()).n.z()), 1.0);
+  EXPECT_THROW(sim.add_triangle(Vec<3>(0, 0, 0), Vec<3>(1, 1, 1), Vec<3>(2, 2, 2), "wall"), std::invalid_argument);
+}
+
+TEST(Triangles, a_ball_rests_on_either_side) {
+  for (double side : {1.0, -1.0}) {
+    auto sim = scene<3>(0.3);
+    sim.gravity = Vec<3>(0, -side * g, 0);
+    const int wall = sim.add_triangle(Vec<3>(-0.1, 0, -0.1), Vec<3>(0.1, 0, -0.1), Vec<3>(0, 0, 0.2), "wall");
+    add<3>(sim, Vec<3>(0.01, side * 2 * r, 0), r);
+    for (int k = 0; k < 100; ++k) sim.step(1e-3);
+    EXPECT_NEAR(positions(sim)[0][1], side * r, 1e-8 * r);
+    EXPECT_NEAR(sim.walls()[wall].force[1], -side * mass<3>(r) * g, 1e-8 * mass<3>(r) * g);
+  }
+}
+
+// Facets smaller and larger than the grain; through the periodic boundary, too.
+TYPED_TEST(Walls, over_the_rims_of_a_flat_floor_of_facets_a_smooth_grain_slides_without_noticing) {
+  constexpr int dim = TypeParam::value;
+  for (const double size : {0.3 * r, 3.7 * r}) {
+    Vec<dim> period = Vec<dim>::Zero();
+    period[0] = 20 * size;
+    if (period[0] < 8 * r) period[0] = 0;
+    auto sim = scene<dim>(0.0, period);
+    sim.gravity = in_plane<dim>(0, -g);
+    add_line<dim>(sim, flat(-10 * size, 10 * size, size));
+    Vec<dim> v = in_plane<dim>(0.31, 0);
+    if (dim == 3) v[2] = 0.02;
+    add<dim>(sim, in_plane<dim>(-3 * r * (period[0] == 0), r), r, v);
+    const int steps = period[0] == 0 ? 150 : 3000;
+    for (int k = 0; k < steps; ++k) {
+      sim.step(1e-3);
+      ASSERT_LT((velocities(sim)[0] - v).norm(), 1e-10) << size << ' ' << k;
+    }
+    EXPECT_NEAR(positions(sim)[0][1], r, 1e-8 * r);
+    Vec<dim> force = Vec<dim>::Zero();
+    for (const Wall<dim>& wall : sim.walls()) force += wall.force;
+    EXPECT_NEAR(force[1], -mass<dim>(r) * g, 1e-8 * mass<dim>(r) * g);
+  }
+}
+
+TYPED_TEST(Walls, a_grain_that_rolls_over_a_flat_floor_of_facets_keeps_rolling) {
+  constexpr int dim = TypeParam::value;
+  auto sim = scene<dim>(0.5);
+  sim.gravity = in_plane<dim>(0, -g);
+  add_line<dim>(sim, flat(-15 * r, 15 * r, 1.5 * r));
+  add<dim>(sim, in_plane<dim>(-14 * r, r), r, in_plane<dim>(0.2, 0), turning<dim>(-0.2 / r));
+  for (int k = 0; k < 1200; ++k) sim.step(1e-3);
+  EXPECT_GT(positions(sim)[0][0], 9 * r);
+  EXPECT_NEAR(velocities(sim)[0][0], 0.2, 1e-8);
+  EXPECT_NEAR(in_plane(spins(sim)[0]), -0.2 / r, 1e-8 / r);
+  EXPECT_NEAR(positions(sim)[0][1], r, 1e-8 * r);
+}
+
+// Inside a polygon each side takes the part of the velocity that is normal to it: cos(angle) is left at every corner, nothing else.
+TYPED_TEST(Walls, along_the_inside_of_a_polygon_a_smooth_grain_loses_at_each_corner_what_points_into_the_next_side) {
+  constexpr int dim = TypeParam::value;
+  constexpr int n = 128;  // at flatter corners the rim of the next side is nearer than its face
+  const double angle = 2 * std::numbers::pi / n, inner = 20 * r;
+  std::vector<Vec<2>> corners;
+  for (int k = 0; k <= n; ++k)
+    corners.push_back(inner / std::cos(angle / 2) * Vec<2>(std::sin((k - 0.5) * angle), -std::cos((k - 0.5) * angle)));
+  auto sim = scene<dim>(0.0);
+  add_line<dim>(sim, corners);
+  add<dim>(sim, in_plane<dim>(0.1 * r, -inner + r), r, in_plane<dim>(0.5, 0));
+  for (int k = 0; k < 1500; ++k) {
+    sim.step(1e-3);
+    const Vec<dim> v = velocities(sim)[0], x = positions(sim)[0];
+    const double turned = std::atan2(v[1], v[0]) / angle;
+    ASSERT_LT(std::hypot(x[0], x[1]), (inner - r) / std::cos(angle / 2) * (1 + 1e-8)) << k;
+    if (turned < -0.5 || turned > n / 4) break;
+    const double sides = std::round(turned);
+    if (std::abs(turned - sides) < 1e-9) {
+      ASSERT_NEAR(v.norm(), 0.5 * std::pow(std::cos(angle), sides), 1e-8) << k;
+    }
+  }
+  EXPECT_GT(velocities(sim)[0][1], 0.1);  // up the other side
+}
+
+// Over a ridge a grain flies straight on; the side behind must not pull or brake it before.
+TYPED_TEST(Walls, over_a_ridge_of_facets_a_smooth_grain_flies_straight_on) {
+  constexpr int dim = TypeParam::value;
+  auto sim = scene<dim>(0.0);
+  add_line<dim>(sim, {Vec<2>(-5 * r, 0), Vec<2>(0, 0), Vec<2>(4 * r, -3 * r)});
+  add<dim>(sim, in_plane<dim>(-4.03 * r, r), r, in_plane<dim>(0.5, 0));
+  for (int k = 0; k < 200; ++k) {
+    sim.step(1e-3);
+    ASSERT_LT((velocities(sim)[0] - in_plane<dim>(0.5, 0)).norm(), 1e-12) << k;
+  }
 }
 
 }  // namespace
