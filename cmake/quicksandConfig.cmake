@@ -25,6 +25,8 @@ if(quicksand_meshes_FOUND AND EXISTS ${CMAKE_CURRENT_LIST_DIR}/quicksand_fluid.c
   if(TARGET PkgConfig::PETSC)
     include(${CMAKE_CURRENT_LIST_DIR}/quicksand_fluid.cmake)
     set(quicksand_fluid_FOUND TRUE)
+    include(${CMAKE_CURRENT_LIST_DIR}/quicksand_coupling.cmake)
+    set(quicksand_coupling_FOUND TRUE)
   endif()
 endif()
 foreach(component ${quicksand_FIND_COMPONENTS})

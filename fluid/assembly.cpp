@@ -35,6 +35,7 @@ ElementInput<dim, order> Fluid<dim>::input(int element) const {
   if (!reaction_.empty()) in.reaction = &reaction_[element * quadrature<dim, order>().size()];
   if constexpr (order == 1)
     for (int t = 0; t < 2; ++t) in.subscale[t] = &subscale_[t][element * quadrature<dim, 1>().size()];
+  if (!advance_.empty()) in.advance = &advance_[element * quadrature<dim, order>().size()];
   in.advection = settings.advection != Advection::none;
   return in;
 }

@@ -1,7 +1,8 @@
 // The volume-averaged equations on one element: Anderson and Jackson, Ind. Eng. Chem. Fund. 6 (1967), "model A", constant density,
 //   d(eps)/dt + div U = 0,   U = eps u,
-//   rho eps (du/dt + (u - w) . grad u) = -eps grad p + eps div(2 eta D(u)) + eps rho g - beta (u - v) + f,
-// u the velocity of the fluid, eps the void fraction, w the velocity of the mesh, beta (v - u) + f the force of what else is there [N/m^3].
+//   rho eps (du/dt + (u - w) . grad u) = -eps grad p + eps div(2 eta D(u)) + eps rho g - beta (u - v) + f - y grad p,
+// u the velocity of the fluid, eps the void fraction, w the velocity of the mesh, beta (v - u) + f - y grad p the force of what else is there
+// [N/m^3]; y stands for grains that the pressure sets in motion (coupling.hpp).
 // Unknowns are U and p: their divergence and gradient stand alone, whatever eps does. eps is continuous and as smooth as U.
 // Momentum is tested with w as it stands, its viscous term integrated by parts: 2 eta D(u) : grad(eps w); the natural condition is that
 // the viscous traction vanishes. A pure function of values; fluid.cpp loops.
@@ -34,6 +35,8 @@ struct Reaction {
   double beta = 0.0;                       // [kg/(m^3 s)]
   Vec<dim> beta_target = Vec<dim>::Zero(); // [N/m^3]
   Vec<dim> force = Vec<dim>::Zero();       // [N/m^3]
+  double yield = 0.0;                      // y [-]
+  Vec<dim> follows = Vec<dim>::Zero();     // solid fraction that goes along with the fluid, along each axis: see Fluid::grains_follow
 };
 
 template <int dim, int order>
@@ -45,6 +48,7 @@ struct ElementInput {
   std::array<Vec<dim>, dim + 1> mesh_velocity;     // [m/s]
   const Reaction<dim>* reaction = nullptr;         // at each quadrature point, or none
   std::array<const Vec<dim>*, 2> subscale{};       // order 1: one and two steps ago, at each quadrature point [m/s]; none: 0
+  const Vec<dim>* advance = nullptr;               // of the solid's flux before, at each quadrature point [m/s]: see Fluid::grains_follow
   bool advection = true;
   bool newton = false;                             // derivative of the advection as well; otherwise by the guess alone
 };
@@ -93,6 +97,9 @@ struct AtPoint {
   std::array<Vec<dim>, n> grad, grad_u;  // of the shape functions, and of u = U/eps per unit of each unknown
   std::array<double, n> inertia;         // what acts along U itself per unit of each unknown: rho dU/dt, advection, reaction
   double eps, eps_rate;                  // d(eps)/dt at a fixed point
+  double drives;                         // what stands before grad p [-]
+  Vec<dim> past_velocity;                // one step ago
+  Vec<dim> follows;                      // of the reaction
   Vec<dim> grad_eps, relative;           // u - w of the guess, which advects; 0 for Stokes
   Mat<dim> slope;                        // grad u of the guess, d u_i / d x_j
   Vec<dim> load;                         // the momentum's other side
@@ -116,6 +123,8 @@ struct AtPoint {
     for (int a = 0; a <= dim; ++a) mesh_velocity += point.l[a] * in.mesh_velocity[a];
     const Reaction<dim> reaction = in.reaction ? in.reaction[q] : Reaction<dim>{};
     eps = eps_at[0];
+    drives = eps + reaction.yield, follows = reaction.follows;
+    past_velocity = flux[1] / eps_at[1];
     eps_rate = rate(time, eps_at[0] - eps_at[1], eps_at[1] - eps_at[2]) - mesh_velocity.dot(grad_eps);
     const double inv_eps = 1.0 / eps;
     relative = in.advection ? Vec<dim>(flux[0] * inv_eps - mesh_velocity) : Vec<dim>::Zero();
@@ -125,7 +134,7 @@ struct AtPoint {
       slope += in.flux[0][a] * grad_u[a].transpose();
       inertia[a] = rho * (time[0] * shape[a] + eps * relative.dot(grad_u[a])) + reaction.beta * inv_eps * shape[a];
     }
-    const Vec<dim> past = time[1] / eps_at[1] * flux[1] + time[2] / eps_at[2] * flux[2];  // of du/dt
+    const Vec<dim> past = time[1] * past_velocity + time[2] / eps_at[2] * flux[2];  // of du/dt
     load = eps * rho * (fluid.gravity - past) + reaction.beta_target + reaction.force;
     if (in.newton) load += rho * slope * flux[0];
     past_subscale.setZero();
@@ -178,13 +187,19 @@ void element_system(const ElementInput<dim, order>& in, const Properties<dim>& f
         }
       }
       for (int b = 0; b <= dim; ++b)
-        for (int i = 0; i < dim; ++i) out.a(row + i, dof_of<dim>(b) + dim) += weight * test * at.eps * g.grad_l[b][i];
+        for (int i = 0; i < dim; ++i) out.a(row + i, dof_of<dim>(b) + dim) += weight * test * at.drives * g.grad_l[b][i];
       for (int i = 0; i < dim; ++i) out.b[row + i] += weight * (test * at.load[i] - stab.bulk * grad[a][i] * at.eps_rate);
     }
     for (int a = 0; a <= dim; ++a) {
       const int row = dof_of<dim>(a) + dim;
       for (int b = 0; b < n; ++b)
         for (int j = 0; j < dim; ++j) out.a(row, dof_of<dim>(b) + j) += weight * rule[q].l[a] * grad[b][j];
+      if (!in.advance) continue;
+      // Of a - a before, by parts: see Fluid::grains_follow.
+      const Vec<dim> with_fluid = weight * at.follows.cwiseProduct(g.grad_l[a]);
+      for (int b = 0; b < n; ++b)
+        for (int j = 0; j < dim; ++j) out.a(row, dof_of<dim>(b) + j) -= shape[b] / at.eps * with_fluid[j];
+      out.b[row] -= with_fluid.dot(at.past_velocity) + weight * g.grad_l[a].dot(in.advance[q]);
     }
     if constexpr (order == 1) {
       std::array<Mat<dim>, n> viscous, strong;  // of the momentum, column j by U_j
@@ -201,7 +216,7 @@ void element_system(const ElementInput<dim, order>& in, const Properties<dim>& f
           const int column = dof_of<dim>(b);
           out.a.template block<dim, dim>(row, column) += along * viscous[b];
           out.a.template block<1, dim>(row + dim, column) += test.transpose() * strong[b];
-          out.a(row + dim, column + dim) += at.eps * test.dot(grad[b]);
+          out.a(row + dim, column + dim) += at.drives * test.dot(grad[b]);
         }
         for (int i = 0; i < dim; ++i) out.b[row + i] -= along * at.past_subscale[i];
         out.b[row + dim] += test.dot(at.load - at.past_subscale);
@@ -217,7 +232,7 @@ void element_subscale(const ElementInput<dim, 1>& in, const Properties<dim>& flu
   for (std::size_t q = 0; q < quadrature<dim, 1>().size(); ++q) {
     const AtPoint<dim, 1> at(in, g, fluid, time, static_cast<int>(q));
     Vec<dim> residual = at.past_subscale - at.load;
-    for (int b = 0; b <= dim; ++b) residual += at.eps * p[b] * at.grad[b] + at.inertia[b] * found[b] + at.viscous(b, fluid.viscosity) * found[b];
+    for (int b = 0; b <= dim; ++b) residual += at.drives * p[b] * at.grad[b] + at.inertia[b] * found[b] + at.viscous(b, fluid.viscosity) * found[b];
     out[q] = -at.stab.tau * residual;
   }
 }

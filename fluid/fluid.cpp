@@ -139,14 +139,50 @@ std::vector<Vec<dim>> Fluid<dim>::quadrature_points() const {
 }
 
 template <int dim>
+std::vector<double> Fluid<dim>::quadrature_weights() const {
+  std::vector<double> weights;
+  each_point([&](const auto&, const auto&, const int*, double weight) { weights.push_back(weight); });
+  return weights;
+}
+
+template <int dim>
 void Fluid<dim>::set_reaction(std::vector<Reaction<dim>> reaction) {
   const std::size_t points = mesh_->elements.size() * with_order(velocity_order(), []<int order>(std::integral_constant<int, order>) { return quadrature<dim, order>().size(); });
-  if (!reaction.empty() && reaction.size() != points)
-    fail("set_reaction: must have one value for each of {} quadrature points, got {}", points, reaction.size());
+  if (!reaction.empty() && reaction.size() != points && reaction.size() != mesh_->nodes.size())
+    fail("set_reaction: must have one value for each of {} quadrature points, or of {} nodes of the mesh, got {}", points, mesh_->nodes.size(), reaction.size());
   for (std::size_t k = 0; k < reaction.size(); ++k)
-    if (!(reaction[k].beta >= 0 && std::isfinite(reaction[k].beta)) || !reaction[k].beta_target.allFinite() || !reaction[k].force.allFinite())
-      fail("set_reaction: beta must be >= 0 kg/(m^3 s), target and force finite, got beta = {} at quadrature point {}", reaction[k].beta, k);
-  reaction_ = std::move(reaction);
+    if (!(reaction[k].beta >= 0 && std::isfinite(reaction[k].beta)) || !reaction[k].beta_target.allFinite() || !reaction[k].force.allFinite() || !(reaction[k].yield >= 0))
+      fail("set_reaction: beta must be >= 0 kg/(m^3 s), target and force finite, yield >= 0, got beta = {}, yield = {} at point {}", reaction[k].beta, reaction[k].yield, k);
+  if (reaction.size() != mesh_->nodes.size()) {
+    reaction_ = std::move(reaction);
+    return;
+  }
+  reaction_.clear();
+  with_order(velocity_order(), [&]<int order>(std::integral_constant<int, order>) {
+    for (const auto& element : mesh_->elements)
+      for (const auto& point : quadrature<dim, order>()) {
+        Reaction<dim>& sum = reaction_.emplace_back();
+        for (int a = 0; a <= dim; ++a) {
+          const Reaction<dim>& at_node = reaction[element[a]];
+          sum.beta += point.l[a] * at_node.beta, sum.yield += point.l[a] * at_node.yield;
+          sum.beta_target += point.l[a] * at_node.beta_target, sum.force += point.l[a] * at_node.force;
+          sum.follows += point.l[a] * at_node.follows;
+        }
+      }
+  });
+}
+
+// Calls use(shapes, their gradients, velocity nodes, weight) at the quadrature points of all elements.
+template <int dim>
+template <class Use>
+void Fluid<dim>::each_point(Use&& use) const {
+  with_order(velocity_order(), [&]<int order>(std::integral_constant<int, order>) {
+    for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
+      const Geometry<dim> g = geometry<dim>(position_, mesh_->elements[e]);
+      for (const auto& point : quadrature<dim, order>())
+        use(shapes<dim, order>(point.l), shape_gradients<dim, order>(point.l, g.grad_l), &space_.node_of[e * space_.per_element], point.weight * g.volume);
+    }
+  });
 }
 
 template <int dim>
@@ -179,20 +215,24 @@ Report Fluid<dim>::step(double dt) {
   const double r = second ? dt / dt_ : 0.0;
   const TimeWeights time = second ? TimeWeights{(1 + 2 * r) / (1 + r) / dt, -(1 + r) / dt, r * r / (1 + r) / dt} : TimeWeights{1 / dt, -1 / dt, 0.0};
   for (int k = 0; k < space_.dofs(); ++k) guess_[k] = x_[0][k] + (second ? r * (x_[0][k] - x_[1][k]) : 0.0);
-  const std::vector<Vec<dim>> mesh_velocity = mesh_velocity_;
-  old_position_ = position_;
+  if (moved_for_ == 0) move(dt);
+  if (moved_for_ != dt) fail("step: the mesh was moved for a step of {} s, got {}", moved_for_, dt);
   std::vector<double> x;
   try {
-    move_mesh(time_ + dt, dt);
+    keep_advance();
+    for (Vec<dim>& a : advance_) a /= dt;
     pore_volume_[0] = pore_volume(eps_[0]);
     for (std::size_t k = 0; k < conditions_.size(); ++k) swept_[0][k] = swept(static_cast<int>(k), dt);
     eps_change_[0] = eps_change(dt);
     x = solve_step(time_ + dt, time, report);
     account(report, x, time);
   } catch (...) {
-    position_ = old_position_, mesh_velocity_ = mesh_velocity;
+    for (Vec<dim>& a : advance_) a *= dt;
+    undo_move();
     throw;
   }
+  moved_for_ = 0.0;
+  if (!advance_.empty()) advance_ = advances(x, dt);
   std::vector<Vec<dim>> subscale = subscales(x, time);
   subscale_[1].swap(subscale_[0]), subscale_[0].swap(subscale);
   x_[1].swap(x_[0]), x_[0].swap(x);
@@ -203,6 +243,49 @@ Report Fluid<dim>::step(double dt) {
   time_weights_ = time, time_ += dt, dt_ = dt;
   ++steps_;
   return report;
+}
+
+template <int dim>
+void Fluid<dim>::move(double dt) {
+  if (moved_for_ != 0) undo_move();
+  old_position_ = position_, old_mesh_velocity_ = mesh_velocity_;
+  moved_for_ = dt;
+  try {
+    move_mesh(time_ + dt, dt);
+  } catch (...) {
+    undo_move();
+    throw;
+  }
+}
+
+template <int dim>
+void Fluid<dim>::undo_move() {
+  position_ = old_position_, mesh_velocity_ = old_mesh_velocity_;
+  moved_for_ = 0.0;
+}
+
+template <int dim>
+void Fluid<dim>::keep_advance() {
+  if (!grains_follow) advance_.clear();
+  else if (advance_.empty()) advance_.assign(quadrature_weights().size(), Vec<dim>::Zero());
+}
+
+// dt f (u - u before) of the flow x at quadrature points.
+template <int dim>
+std::vector<Vec<dim>> Fluid<dim>::advances(const std::vector<double>& x, double dt) const {
+  std::vector<Vec<dim>> all;
+  each_point([&](const auto& shape, const auto&, const int* node, double) {
+    std::array<double, 2> eps{};
+    std::array<Vec<dim>, 2> flux{Vec<dim>::Zero(), Vec<dim>::Zero()};
+    for (std::size_t a = 0; a < shape.size(); ++a)
+      for (int t = 0; t < 2; ++t) {
+        eps[t] += shape[a] * eps_[t][node[a]];
+        flux[t] += shape[a] * Eigen::Map<const Vec<dim>>(&(t == 0 ? x : x_[0])[space_.first_dof[node[a]]]);
+      }
+    const Vec<dim> follows = reaction_.empty() ? Vec<dim>(Vec<dim>::Zero()) : reaction_[all.size()].follows;
+    all.push_back(dt * follows.cwiseProduct(flux[0] / eps[0] - flux[1] / eps[1]));
+  });
+  return all;
 }
 
 template <int dim>
@@ -226,13 +309,14 @@ std::vector<double> Fluid<dim>::solve_step(double t, const TimeWeights& time, Re
 template <int dim>
 template <class Visit>
 void Fluid<dim>::each_part(Visit&& visit) {
+  keep_advance();
   double steps = steps_, started = eps_started_;
   for (double* one : {&time_, &dt_, &steps, &started}) visit(std::span(one, 1));
   steps_ = static_cast<int>(steps), eps_started_ = started != 0.0;
   for (auto* many : {&x_[0], &x_[1], &eps_[0], &eps_[1], &eps_[2], &eps_change_[0], &eps_change_[1], &swept_[0], &swept_[1], &swept_[2]}) visit(std::span(*many));
   visit(std::span(pore_volume_));
   visit(std::span(time_weights_));
-  for (auto* points : {&position_, &mesh_velocity_, &subscale_[0], &subscale_[1]})
+  for (auto* points : {&position_, &mesh_velocity_, &subscale_[0], &subscale_[1], &advance_})
     if (!points->empty()) visit(std::span(points->data()->data(), dim * points->size()));
 }
 
@@ -270,7 +354,7 @@ void Fluid<dim>::restore(std::span<const double> state) {
     std::copy_n(state.begin() + at, part.size(), part.begin());
     at += part.size();
   });
-  old_position_ = position_;
+  old_position_ = position_, moved_for_ = 0.0;
   if (solver_) solver_->forget();
 }
 

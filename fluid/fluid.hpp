@@ -77,10 +77,19 @@ class Fluid {
   // Flux and pressure to start from; also the past of the first step.
   void set_velocity(std::span<const Vec<dim>> u);
   void set_pressure(std::span<const double> p);
-  // At quadrature_points(), element by element; empty: none.
+  // At quadrature_points(), element by element, or at the nodes of the mesh, linear between them; empty: none.
   void set_reaction(std::vector<Reaction<dim>> reaction);
   std::vector<Vec<dim>> quadrature_points() const;
+  std::vector<double> quadrature_weights() const;  // they add up to the volume [m^dim]
+  // The grains' void fraction is that of the start of a step: d(eps)/dt lags behind by one, and where grains follow the fluid, u ~ v, a column
+  // of more than half solids would answer every step with a larger one, u = -(1 - eps)/eps v. With this set, continuity takes the change of the
+  // solid's flux that goes with the fluid's own in advance, and gives back what it took a step before:
+  //   d(eps)/dt + div(U + a - a before) = 0,  a = f (u - u before), f the solid fraction that follows, given with the reaction:
+  // of second order in time, no volume is lost, and none crosses a boundary. Where grains are held it would do harm.
+  bool grains_follow = false;
 
+  // Moves the mesh for the coming step of dt, so that what is set then is of the mesh where it will be; step() does it where this was not called.
+  void move(double dt);
   Report step(double dt);
   Report solve_steady();
 
@@ -113,6 +122,16 @@ class Fluid {
     Vec<dim> pressure_gradient;
   };
   std::vector<Probe> probe(std::span<const Vec<dim>> x) const;
+  // Projected on the nodes of the mesh with lumped masses, int N f/int N of each: what grains are told, adjoint to fields that are linear between nodes.
+  struct Projected {
+    std::vector<Vec<dim>> velocity;           // u [m/s]
+    std::vector<Vec<dim>> pressure_gradient;  // [Pa/m]
+    std::vector<Vec<dim>> viscous_force;      // div(2 eta D(u)), the traction at the boundary included [N/m^3]
+  };
+  Projected projected() const;
+  // Of the last step: what its equations leave open, summed over all that is not held; and the force of the reaction on the fluid [N] (2D: N/m).
+  Vec<dim> momentum_residual() const;
+  Vec<dim> reaction_force() const;
   // Relative L2 errors against a known flow, by a rule of degree 4 or more.
   struct Error {
     double velocity, pressure;
@@ -142,6 +161,7 @@ class Fluid {
   template <class Visit>
   void each_part(Visit&& visit);
   void move_mesh(double t, double dt);
+  void undo_move();
   std::vector<Vec<dim>> harmonic(const std::vector<std::vector<int>>& moved, const std::vector<std::vector<Vec<dim>>>& velocity);
   std::vector<Vec<dim>> stretch(const std::vector<std::vector<int>>& moved, const std::vector<std::vector<Vec<dim>>>& velocity) const;
   double pore_volume(const std::vector<double>& eps) const;
@@ -152,6 +172,10 @@ class Fluid {
   template <int order>
   ElementInput<dim, order> input(int element) const;
   std::vector<Vec<dim>> subscales(const std::vector<double>& x, const TimeWeights& time) const;
+  void keep_advance();
+  std::vector<Vec<dim>> advances(const std::vector<double>& x, double dt) const;
+  template <class Use>
+  void each_point(Use&& use) const;
   template <int order>
   void scatter(int local, const ElementSystem<dim, order>& system);
   template <int order>
@@ -183,10 +207,12 @@ class Fluid {
   int turns_ = 0;
   std::optional<double> mean_pressure_;
   std::vector<Vec<dim>> position_, old_position_;  // of mesh nodes, now and at the start of the step
-  std::vector<Vec<dim>> mesh_velocity_;            // of mesh nodes
+  std::vector<Vec<dim>> mesh_velocity_, old_mesh_velocity_;  // of mesh nodes
+  double moved_for_ = 0.0;                         // length of the coming step where move() was called, else 0 [s]
   std::array<std::vector<double>, 3> eps_;         // at velocity nodes: now, one and two steps ago
   std::array<std::vector<double>, 2> x_;           // unknowns, Cartesian, after the last step and the one before
   std::array<std::vector<Vec<dim>>, 2> subscale_;  // order 1: at quadrature points, after the last step and the one before [m/s]
+  std::vector<Vec<dim>> advance_;                  // with grains_follow: dt a of the last step at quadrature points [m]
   std::vector<double> guess_;                      // that advects
   std::array<double, 3> pore_volume_{};            // int eps: now, and one and two steps ago [m^dim]
   std::array<std::vector<double>, 3> swept_;       // by each boundary over this step, the last and the one before: int eps w . n [m^dim]

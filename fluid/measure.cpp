@@ -160,6 +160,100 @@ auto Fluid<dim>::probe(std::span<const Vec<dim>> x) const -> std::vector<Probe> 
   return found;
 }
 
+template <int dim>
+auto Fluid<dim>::projected() const -> Projected {
+  const std::vector<Vec<dim>> none(space_.nodes(), Vec<dim>::Zero());
+  Projected sum{none, none, none};
+  struct There {
+    Vec<dim> u;
+    Mat<dim> stress;  // 2 eta D(u)
+  };
+  auto flow = [&]<int order>(std::integral_constant<int, order>, int element, const Barycentric<dim>& l, const Geometry<dim>& g) {
+    constexpr int n = shape_count<dim, order>;
+    const auto shape = shapes<dim, order>(l);
+    const auto grad = shape_gradients<dim, order>(l, g.grad_l);
+    double eps = 0.0;
+    Vec<dim> flux = Vec<dim>::Zero(), grad_eps = Vec<dim>::Zero();
+    Mat<dim> slope = Mat<dim>::Zero();
+    for (int a = 0; a < n; ++a) {
+      const int node = space_.node_of[element * n + a];
+      const Vec<dim> here = Eigen::Map<const Vec<dim>>(&x_[0][space_.first_dof[node]]);
+      eps += shape[a] * eps_[1][node], grad_eps += eps_[1][node] * grad[a];
+      flux += shape[a] * here, slope += here * grad[a].transpose();
+    }
+    There there{flux / eps, {}};
+    slope = (slope - there.u * grad_eps.transpose()) / eps;
+    there.stress = properties.viscosity * (slope + slope.transpose());
+    return there;
+  };
+  with_order(velocity_order(), [&]<int order>(std::integral_constant<int, order> constant) {
+    for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
+      const auto& corners = mesh_->elements[e];
+      const Geometry<dim> g = geometry<dim>(position_, corners);
+      Vec<dim> grad_p = Vec<dim>::Zero();
+      for (int a = 0; a <= dim; ++a) grad_p += x_[0][space_.pressure_dof(space_.vertex[corners[a]])] * g.grad_l[a];
+      for (const auto& point : quadrature<dim, order>()) {
+        const There there = flow(constant, static_cast<int>(e), point.l, g);
+        const double weight = point.weight * g.volume;
+        for (int a = 0; a <= dim; ++a) {
+          const int node = space_.vertex[corners[a]];
+          sum.velocity[node] += weight * point.l[a] * there.u;
+          sum.pressure_gradient[node] += weight * point.l[a] * grad_p;
+          sum.viscous_force[node] -= weight * there.stress * g.grad_l[a];
+        }
+      }
+    }
+    for (std::size_t f = 0; f < mesh_->facets.size(); ++f) {
+      if (mesh_->facet_elements[f][1] >= 0) continue;
+      const FacetView<dim> facet(*mesh_, position_, static_cast<int>(f));
+      along<dim>(facet, [&](const Barycentric<dim>& l, double weight) {
+        const Vec<dim> traction = weight * flow(constant, facet.element, l, facet.geometry).stress * facet.area;
+        for (int a = 0; a <= dim; ++a) sum.viscous_force[space_.vertex[mesh_->elements[facet.element][a]]] += l[a] * traction;
+      });
+    }
+  });
+  const std::vector<double> volumes = vertex_volumes();
+  Projected at_nodes;
+  for (const int node : space_.vertex) {
+    at_nodes.velocity.push_back(sum.velocity[node] / volumes[node]);
+    at_nodes.pressure_gradient.push_back(sum.pressure_gradient[node] / volumes[node]);
+    at_nodes.viscous_force.push_back(sum.viscous_force[node] / volumes[node]);
+  }
+  return at_nodes;
+}
+
+template <int dim>
+Vec<dim> Fluid<dim>::momentum_residual() const {
+  Vec<dim> sum = Vec<dim>::Zero();
+  for (int node = 0; node < space_.nodes(); ++node) {
+    const Held& held = held_[node];
+    Vec<dim> left = held.frame.transpose() * Eigen::Map<const Vec<dim>>(&reaction_at_nodes_[space_.first_dof[node]]);
+    left.head(held.last).setZero();
+    sum += held.frame * left;
+  }
+  return sum;
+}
+
+template <int dim>
+Vec<dim> Fluid<dim>::reaction_force() const {
+  Vec<dim> sum = Vec<dim>::Zero();
+  if (reaction_.empty()) return sum;
+  with_order(velocity_order(), [&]<int order>(std::integral_constant<int, order>) {
+    const auto& rule = quadrature<dim, order>();
+    for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
+      const auto& corners = mesh_->elements[e];
+      const Geometry<dim> g = geometry<dim>(position_, corners);
+      Vec<dim> grad_p = Vec<dim>::Zero();
+      for (int a = 0; a <= dim; ++a) grad_p += x_[0][space_.pressure_dof(space_.vertex[corners[a]])] * g.grad_l[a];
+      for (std::size_t q = 0; q < rule.size(); ++q) {
+        const Reaction<dim>& r = reaction_[e * rule.size() + q];
+        sum += rule[q].weight * g.volume * (r.beta_target + r.force - r.beta * velocity_in(static_cast<int>(e), rule[q].l) - r.yield * grad_p);
+      }
+    }
+  });
+  return sum;
+}
+
 template class Fluid<2>;  // of the members defined here
 template class Fluid<3>;
 

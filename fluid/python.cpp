@@ -186,7 +186,8 @@ template <int dim>
 void add_fluid(py::module_& m, const char* name) {
   using F = FluidInPython<dim>;
   static constexpr Words<typename F::MeshMotion> motions = {{"harmonic", F::MeshMotion::harmonic}, {"stretch", F::MeshMotion::stretch}};
-  py::class_<F>(m, name)
+  py::class_<Fluid<dim>>(m, fmt::format("_{}", name).c_str());  // what quicksand.coupling takes
+  py::class_<F, Fluid<dim>>(m, name)
       .def(py::init([](std::shared_ptr<Mesh<dim>> mesh, double density, double viscosity, const std::string& element, const py::object& gravity) {
              Properties<dim> properties;
              properties.density = density, properties.viscosity = viscosity;
@@ -236,6 +237,7 @@ void add_fluid(py::module_& m, const char* name) {
            "beta"_a = py::none(), "target"_a = py::none(), "force"_a = py::none(),
            "Force on the fluid per volume, beta (target - u) + force [N/m^3]: beta a number, an array over `quadrature_points`, or f(x, t) [kg/(m^3 s)]; target [m/s] and force likewise, (dim,)\n"
            "or (n, dim). Without arguments: none.")
+      .def_readwrite("grains_follow", &F::grains_follow, "Continuity takes in advance what of the solid's flux goes with the fluid's own: set by `quicksand.coupling` where grains move.")
       .def("step", [](F& f, double dt) { f.evaluate(f.time() + dt); return f.step(dt); }, "dt"_a,
            "A step of dt [s]. Raises NotConverged, with the state as before the step.")
       .def("solve_steady", [](F& f) { f.evaluate(f.time()); return f.solve_steady(); }, "The steady flow, from the present one. Raises NotConverged.")

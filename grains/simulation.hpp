@@ -118,6 +118,9 @@ class Simulation {
   const std::vector<Vec<dim>>& drag_impulse() const;       // sum of h gamma (u - v) [N s] (2D: N s/m)
   const std::vector<Vec<dim>>& contact_impulse() const;    // of all contacts together [N s]
   const std::vector<std::uint8_t>& in_contact() const;     // whether any contact bore load in any sub-step
+  // By id, bit k: along axis k the grain, or one that it hangs together with by contacts of the last sub-step that bear load, leans on a wall
+  // that does not yield that way.
+  std::vector<std::uint8_t> held() const;
 
   // The contact problem of the last sub-step and the impulses that were found for it [N s] (2D: N s/m); see delassus().
   // Throws std::invalid_argument where no sub-step was made since the scene was changed from outside or restored.

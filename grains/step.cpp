@@ -4,6 +4,7 @@
 #include "simulation.hpp"
 
 #include <chrono>
+#include <numeric>
 
 namespace quicksand {
 
@@ -745,6 +746,41 @@ void Simulation<dim>::note_contacts() {
     }
   for (const WallContact<dim>& c : wall_contacts_)
     if (c.p.n > 0) note(c.j, impulse_vector<dim>(c.n, c.p.n, c.p.t));
+}
+
+template <int dim>
+std::vector<std::uint8_t> Simulation<dim>::held() const {
+  const int n = grains_.size();
+  std::vector<int> root(n + walls_.size());  // union-find: grains, then walls
+  std::vector<std::uint8_t> axes(root.size(), 0);
+  std::iota(root.begin(), root.end(), 0);
+  auto find = [&](int k) {
+    while (root[k] != k) k = root[k] = root[root[k]];
+    return k;
+  };
+  auto join = [&](int a, int b) { root[std::max(find(a), find(b))] = std::min(find(a), find(b)); };
+  for (int k = 0; k < n; ++k)
+    if (grains_.wall[k] >= 0) join(k, n + grains_.wall[k]);
+  std::vector<std::uint8_t> stiff(walls_.size(), 0), leans(n, 0);
+  for (std::size_t w = 0; w < walls_.size(); ++w)
+    for (int k = 0; k < dim; ++k) stiff[w] |= (walls_[w].inv_m[k] == 0) << k;
+  // An impulse mostly across an axis does not hold along it.
+  auto lean = [&](int grain, int wall, const Vec<dim>& p) {
+    for (int k = 0; k < dim; ++k)
+      if (std::abs(p[k]) > 0.05 * p.norm()) leans[grain] |= stiff[wall] & (1 << k);
+  };
+  for (std::size_t b = 0; b < count_.size(); ++b)
+    for (int k = neighbours_.blocks[b].begin; k < neighbours_.blocks[b].begin + count_[b]; ++k) {
+      const Contact<dim>& c = contacts_[k];
+      if (c.p.n <= 0) continue;
+      join(c.i, c.j);
+      for (const auto [grain, other] : {std::pair{c.i, c.j}, std::pair{c.j, c.i}})
+        if (grains_.wall[other] >= 0) lean(grain, grains_.wall[other], impulse_vector<dim>(c.n, c.p.n, c.p.t));
+    }
+  for (const WallContact<dim>& c : wall_contacts_)
+    if (c.p.n > 0) join(c.j, n + c.wall), lean(c.j, c.wall, impulse_vector<dim>(c.n, c.p.n, c.p.t));
+  for (int k = 0; k < n; ++k) axes[find(k)] |= leans[k];
+  return by_id([&](const Grains<dim>&, int k) { return axes[find(k)]; });
 }
 
 template <int dim>

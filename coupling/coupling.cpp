@@ -1,0 +1,345 @@
+#include "coupling.hpp"
+
+#include "meshes/errors.hpp"
+
+#include <chrono>
+
+namespace quicksand::coupling {
+
+using meshes::fail;
+using meshes::place;
+
+namespace {
+
+double seconds() { return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count(); }
+
+}  // namespace
+
+DragLaw of_each(double (*law)(const Suspension&)) {
+  return [law](std::span<const Suspension> s, std::span<double> gamma) {
+    for (std::size_t k = 0; k < s.size(); ++k) gamma[k] = law(s[k]);
+  };
+}
+
+template <int dim>
+Coupling<dim>::Coupling(Simulation<dim>& grains, fluid::Fluid<dim>& fluid, Settings settings)
+    : grains_(grains), fluid_(fluid), settings_(std::move(settings)), mesh_(fluid.space().mesh), walker_(mesh_, grains.box().period),
+      kernel_(mesh_, settings_.kernel, settings_.kernel_radius, grains.box().period), outlet_(mesh_->boundary_names.size(), false) {
+  const Vec<dim>& period = grains.box().period;
+  Vec<dim> low = mesh_->nodes[0], high = low, shift = Vec<dim>::Zero();
+  for (const Vec<dim>& x : mesh_->nodes) low = low.cwiseMin(x), high = high.cwiseMax(x);
+  for (std::size_t k = 0; k < mesh_->nodes.size(); ++k) shift = shift.cwiseMax((mesh_->nodes[k] - mesh_->nodes[mesh_->master[k]]).cwiseAbs());
+  for (int k = 0; k < dim; ++k) {
+    if ((period[k] > 0) != (shift[k] > 0) || std::abs(period[k] - shift[k]) > 1e-9 * period[k])
+      fail("Coupling: the grains' period along axis {} is {} m, that of the mesh {} m (0: not periodic); they must be the same", k, period[k], shift[k]);
+    if (period[k] > 0 && std::abs(high[k] - low[k] - period[k]) > 1e-9 * period[k])
+      fail("Coupling: the mesh must extend over one period along axis {}, {} m, but does over {}", k, period[k], high[k] - low[k]);
+  }
+  if (settings_.fluid_moves) {
+    fluid_.settings.scheme = fluid::Scheme::backward_euler;
+    fluid_.grains_follow = settings_.grains_move;
+  }
+  flow_ = fluid_.projected();
+}
+
+template <int dim>
+void Coupling<dim>::follow(const std::string& boundary, int wall) {
+  if (wall < 0 || wall >= static_cast<int>(grains_.walls().size())) fail("follow: there is no wall {}, but {}", wall, grains_.walls().size());
+  auto follow = std::make_shared<Follow>(Follow{wall, grains_.walls()[wall].point, Vec<dim>::Zero()});
+  fluid_.move_boundary(boundary, [follow](std::span<const Vec<dim>> x, double) { return std::vector<Vec<dim>>(x.size(), follow->velocity); });
+  follows_[boundary] = std::move(follow);
+}
+
+template <int dim>
+void Coupling<dim>::set_outlet(const std::string& boundary) {
+  outlet_[meshes::boundary_number(*mesh_, boundary, "set_outlet")] = true;
+}
+
+template <int dim>
+double Coupling<dim>::solid_volume_of(int i) const {
+  return solid_volume<dim>(r_[i]);
+}
+
+template <int dim>
+void Coupling<dim>::take_grains() {
+  x_ = grains_.by_id([&](const Grains<dim>& g, int k) { return walker_.wrap(g.x[k]); });
+  v_ = grains_.by_id([](const Grains<dim>& g, int k) { return Vec<dim>(g.body[k].v); });
+  r_ = grains_.by_id([](const Grains<dim>& g, int k) { return g.r[k]; });
+  m_ = grains_.by_id([](const Grains<dim>& g, int k) { return 1.0 / g.body[k].inv_m; });
+  const std::size_t n = x_.size();
+  carry_.resize(n, Vec<dim>::Zero()), free_.resize(n, false), held_.resize(n, 255), place_.resize(n), drag_.resize(n), answer_.resize(n);  // new grains
+}
+
+// Where grains are; those that have left through an outlet are taken out.
+template <int dim>
+void Coupling<dim>::locate() {
+  std::vector<int> gone;
+  for (std::size_t i = 0; i < x_.size(); ++i) {
+    place_[i] = walker_.find(x_[i], place_[i]);
+    if (place_[i].left_by < 0) continue;
+    if (!outlet_[place_[i].left_by])
+      fail("Coupling: grain {} at {} m is outside the mesh, beyond boundary \"{}\". Grains need a wall there, or call outlet(\"{}\") to let them go", i, place(x_[i]),
+           mesh_->boundary_names[place_[i].left_by], mesh_->boundary_names[place_[i].left_by]);
+    gone.push_back(static_cast<int>(i));
+  }
+  if (gone.empty()) return;
+  grains_.remove(gone);
+  removed_ += static_cast<int>(gone.size());
+  auto keep = [&](auto& values) {
+    std::size_t to = 0, next = 0;
+    for (std::size_t i = 0; i < values.size(); ++i)
+      if (next < gone.size() && gone[next] == static_cast<int>(i)) ++next;
+      else values[to++] = values[i];
+    values.resize(to);
+  };
+  keep(x_), keep(v_), keep(r_), keep(m_), keep(carry_), keep(free_), keep(held_), keep(place_), keep(drag_), keep(answer_);
+}
+
+template <int dim>
+template <class T>
+T Coupling<dim>::at_grain(int i, const std::vector<T>& at_nodes) const {
+  const Weights<dim>& w = kernel_.weights();
+  T sum = w.weight[w.start[i]] * at_nodes[w.node[w.start[i]]];
+  for (int k = w.start[i] + 1; k < w.start[i + 1]; ++k) sum += w.weight[k] * at_nodes[w.node[k]];
+  return sum;
+}
+
+// c of the text above.
+template <int dim>
+double Coupling<dim>::share_of(double k) const {
+  if (k < 1e-4) return 0.5 * k * (1 + 1.0 / sub_steps_);  // to rounding, where the formula loses digits
+  return 1 + std::expm1(-sub_steps_ * std::log1p(k / sub_steps_)) / k;
+}
+
+// Drag of the chosen grains about these slips, F(|w|) w/|w|; growth: d ln gamma/d ln |w|.
+template <int dim>
+void Coupling<dim>::linearise(const std::vector<int>& which, const std::vector<Vec<dim>>& slip, std::vector<double>& growth) {
+  constexpr double more = 1e-4;
+  std::vector<Suspension> seen;
+  for (const double factor : {1.0, 1.0 + more})
+    for (const int i : which) {
+      double eps = at_grain(i, eps_);
+      if (dim == 2 && settings_.discs == Discs::spheres) eps = void_fraction_of_spheres(eps);
+      seen.push_back({2 * r_[i], eps, factor * slip[i].norm(), fluid_.properties.density, fluid_.properties.viscosity});
+    }
+  std::vector<double> gamma(seen.size());
+  settings_.drag(seen, gamma);
+  for (std::size_t k = 0; k < which.size(); ++k) {
+    const int i = which[k];
+    if (!(gamma[k] >= 0 && std::isfinite(gamma[k])))
+      fail("Coupling: the drag law gives {} kg/s for grain {}: slip {} m/s, void fraction {}, diameter {} m", gamma[k], i, seen[k].slip, seen[k].eps, seen[k].diameter);
+    growth[i] = gamma[k] > 0 ? std::clamp(std::log(gamma[which.size() + k] / gamma[k]) / std::log1p(more), 0.0, 2.0) : 0.0;
+    const double scale = dim == 2 ? per_depth(settings_.discs, 2 * r_[i]) : 1.0;
+    drag_[i] = {scale * gamma[k] * (1 + growth[i]), slip[i] * (growth[i] / (1 + growth[i]))};
+  }
+}
+
+// Drag of every grain, linear about the slip that it will have: of free grains in the flow as it is, of others their slip now.
+template <int dim>
+void Coupling<dim>::expect_drag(double dt) {
+  const int n = static_cast<int>(x_.size());
+  std::vector<Vec<dim>> u(n), slip(n);
+  std::vector<double> growth(n);
+  std::vector<int> which(n);
+  for (int i = 0; i < n; ++i) u[i] = at_grain(i, flow_.velocity), slip[i] = u[i] - v_[i], which[i] = i;
+  for (int rounds = 0; !which.empty() && rounds < 30; ++rounds) {
+    linearise(which, slip, growth);
+    std::vector<int> again;
+    for (const int i : which) {
+      if (!free_[i] || !settings_.grains_move) continue;
+      const double k = dt * drag_[i].gamma / m_[i], left = std::exp(-sub_steps_ * std::log1p(k / sub_steps_));
+      const Vec<dim> rest = m_[i] * grains_.gravity + stress_force_[i];
+      // Without drag it would fall freely; with it, it tends to u - shift + rest/gamma.
+      const Vec<dim> end = k > 1e-8 ? Vec<dim>(u[i] - drag_[i].shift + rest / drag_[i].gamma) : Vec<dim>(v_[i] + dt / m_[i] * rest);
+      const Vec<dim> next = u[i] - (k > 1e-8 ? Vec<dim>(end + left * (v_[i] - end)) : end);
+      const double before = slip[i].norm(), after = next.norm();
+      if (after > 2 * before || growth[i] * std::abs(after - before) > 0.03 * before) again.push_back(i);
+      slip[i] = next;
+    }
+    which.swap(again);
+  }
+}
+
+template <int dim>
+void Coupling<dim>::set_reaction(double dt) {
+  std::vector<fluid::Reaction<dim>> at_nodes(mesh_->nodes.size());
+  const Weights<dim>& w = kernel_.weights();
+  const std::vector<double>& mass = kernel_.masses();
+  for (std::size_t i = 0; i < x_.size(); ++i) {
+    const double gamma = drag_[i].gamma, c = settings_.grains_move ? share_of(dt * gamma / m_[i]) : 0.0;
+    Answer& answer = answer_[i];
+    answer = {gamma, started_ ? c * solid_volume_of(static_cast<int>(i)) : 0.0, Vec<dim>::Zero()};
+    if (free_[i] && settings_.grains_move) {
+      answer.beta = (1 - c) * gamma;
+      answer.given = c * (m_[i] * grains_.gravity + stress_force_[i]);
+    }
+    const Vec<dim> target = answer.beta * (v_[i] + drag_[i].shift);
+    const Vec<dim> force = answer.given + answer.yield * at_grain(static_cast<int>(i), flow_.pressure_gradient) + carry_[i] / dt;
+    for (int k = w.start[i]; k < w.start[i + 1]; ++k) {
+      fluid::Reaction<dim>& there = at_nodes[w.node[k]];
+      const double share = w.weight[k] / mass[w.node[k]];
+      there.beta += share * answer.beta, there.yield += share * answer.yield;
+      there.beta_target += share * target, there.force += share * force;
+      for (int axis = 0; axis < dim; ++axis)
+        if (!(held_[i] >> axis & 1)) there.follows[axis] += share * solid_volume_of(static_cast<int>(i));
+    }
+  }
+  for (std::size_t k = 0; k < at_nodes.size(); ++k) at_nodes[k] = at_nodes[mesh_->master[k]];
+  fluid_.set_reaction(std::move(at_nodes));
+}
+
+template <int dim>
+Report<dim> Coupling<dim>::step(double dt) {
+  if (!(dt > 0 && std::isfinite(dt))) fail("step: dt must be > 0 s and finite, got {}", dt);
+  if (settings_.grains_move) grains_.check(dt);
+  if (settings_.fluid_moves && fluid_.settings.scheme != fluid::Scheme::backward_euler)
+    fail("step: the fluid's scheme must be backward_euler when it is coupled: grains are of first order, and volumes add up only then");
+  Report<dim> report;
+  report.dt = dt;
+  const double begun = seconds();
+  if (!follows_.empty()) {
+    for (auto& [boundary, follow] : follows_) {
+      follow->velocity = (grains_.walls()[follow->wall].point - follow->from) / dt;
+      for (int k = 0; k < dim; ++k)
+        if (grains_.box().period[k] > 0) follow->velocity[k] = 0.0;
+    }
+    fluid_.move(dt);
+    auto nodes = fluid_.nodes();
+    nodes.resize(mesh_->nodes.size());
+    walker_.place(nodes);
+    kernel_.place(nodes);
+  }
+  take_grains();
+  const int before = removed_;
+  locate();
+  report.removed = removed_ - before;
+  const int n = static_cast<int>(x_.size());
+  const Weights<dim>& w = kernel_.weigh(x_, place_);
+  if (settings_.fluid_moves) {
+    std::vector<double> solid(mesh_->nodes.size(), 0.0);
+    for (int i = 0; i < n; ++i)
+      for (int k = w.start[i]; k < w.start[i + 1]; ++k) solid[w.node[k]] += w.weight[k] * solid_volume_of(i);
+    eps_.resize(solid.size());
+    for (std::size_t k = 0; k < solid.size(); ++k) eps_[k] = 1 - solid[mesh_->master[k]] / kernel_.masses()[k];
+    fluid_.set_void_fraction(eps_);
+  } else {
+    eps_ = fluid_.void_fraction();
+  }
+  if (!settings_.fluid_moves) flow_ = fluid_.projected();
+  stress_force_.resize(n);
+  auto stress = [&] {
+    for (int i = 0; i < n; ++i) stress_force_[i] = solid_volume_of(i) * (at_grain(i, flow_.viscous_force) - at_grain(i, flow_.pressure_gradient));
+  };
+  stress();
+  expect_drag(dt);
+  Vec<dim> handed = Vec<dim>::Zero();
+  std::vector<Vec<dim>> pressure_before(n);
+  if (settings_.fluid_moves) {
+    for (int i = 0; i < n; ++i) handed += carry_[i], pressure_before[i] = at_grain(i, flow_.pressure_gradient);
+    set_reaction(dt);
+    const double stepping = seconds();
+    report.fluid = fluid_.step(dt);
+    report.fluid_time = seconds() - stepping;
+    flow_ = fluid_.projected();
+    stress();
+  }
+  // Carried impulse is what the fluid gave, as its own answer has it, less what the grains got.
+  Vec<dim> given = Vec<dim>::Zero();
+  std::vector<double> gamma(n);
+  std::vector<Vec<dim>> target(n);
+  for (int i = 0; i < n; ++i) {
+    gamma[i] = drag_[i].gamma, target[i] = at_grain(i, flow_.velocity) - drag_[i].shift;
+    if (!settings_.fluid_moves) continue;
+    carry_[i] = dt * (answer_[i].beta * (target[i] - v_[i]) - answer_[i].given + answer_[i].yield * (at_grain(i, flow_.pressure_gradient) - pressure_before[i]));
+    given += carry_[i];
+  }
+  drag_force_.resize(n);
+  Vec<dim> grains_error = Vec<dim>::Zero();
+  if (settings_.grains_move) {
+    const double stepping = seconds();
+    grains_.set_force(stress_force_);
+    grains_.set_drag(gamma, target);
+    for (auto& [boundary, follow] : follows_) follow->from = grains_.walls()[follow->wall].point;
+    report.grains = grains_.step(dt);
+    report.grains_time = seconds() - stepping;
+    sub_steps_ = report.grains.sub_steps;
+    drag_force_ = grains_.drag_impulse();
+    const auto in_contact = grains_.in_contact();
+    held_ = grains_.held();
+    const auto contact_impulse = grains_.contact_impulse();
+    const auto after = grains_.by_id([](const Grains<dim>& g, int k) { return Vec<dim>(g.body[k].v); });
+    for (int i = 0; i < n; ++i) {
+      free_[i] = !in_contact[i];
+      grains_error += m_[i] * (after[i] - v_[i]) - dt * (m_[i] * grains_.gravity + stress_force_[i]) - drag_force_[i] - contact_impulse[i];
+    }
+  } else {
+    for (int i = 0; i < n; ++i) drag_force_[i] = dt * gamma[i] * target[i];
+  }
+  Vec<dim> carried = Vec<dim>::Zero();
+  double apart = 0.0;
+  for (int i = 0; i < n; ++i) {
+    report.exchanged_impulse += drag_force_[i].norm();
+    carry_[i] = settings_.fluid_moves ? Vec<dim>(carry_[i] - drag_force_[i]) : Vec<dim>::Zero();
+    carried += carry_[i], apart += carry_[i].norm();
+    drag_force_[i] /= dt;
+    report.drag += drag_force_[i];
+  }
+  if (report.exchanged_impulse > 0) {
+    report.carried_impulse = carried.norm() / report.exchanged_impulse, report.disagreement = apart / report.exchanged_impulse;
+    if (settings_.fluid_moves)
+      report.momentum_error = (dt * fluid_.momentum_residual() + (dt * fluid_.reaction_force() + given - handed) + grains_error).norm() / report.exchanged_impulse;
+  }
+  started_ = true;
+  report.time = grains_.time();
+  report.exchange_time = seconds() - begun - report.fluid_time - report.grains_time;
+  return report;
+}
+
+template <int dim>
+std::vector<double> Coupling<dim>::state() const {
+  std::vector<double> all{static_cast<double>(place_.size()), static_cast<double>(sub_steps_), static_cast<double>(started_), static_cast<double>(removed_)};
+  for (std::size_t i = 0; i < place_.size(); ++i) {
+    all.push_back(free_[i]), all.push_back(held_[i]), all.push_back(place_[i].element);
+    all.insert(all.end(), carry_[i].data(), carry_[i].data() + dim);
+  }
+  for (const auto& [boundary, follow] : follows_) all.insert(all.end(), follow->from.data(), follow->from.data() + dim);
+  all.insert(all.end(), kernel_.balance().begin(), kernel_.balance().end());
+  return all;
+}
+
+template <int dim>
+void Coupling<dim>::restore(std::span<const double> state) {
+  const std::size_t n = grains_.count(), size = 4 + n * (3 + dim) + follows_.size() * dim + kernel_.balance().size();
+  if (state.size() != size || state[0] != static_cast<double>(n))
+    fail("restore: the state has {} numbers where {} grains, {} boundaries that follow walls and this mesh and kernel have {}; restore grains and fluid first, and call follow as "
+         "before", state.size(), n, follows_.size(), size);
+  const double* at = state.data() + 1;
+  sub_steps_ = static_cast<int>(*at++), started_ = *at++ != 0.0, removed_ = static_cast<int>(*at++);
+  free_.resize(n), held_.resize(n), place_.resize(n), carry_.resize(n);
+  for (std::size_t i = 0; i < n; ++i) {
+    free_[i] = *at++ != 0.0, held_[i] = static_cast<std::uint8_t>(*at++), place_[i].element = static_cast<int>(*at++);
+    carry_[i] = Eigen::Map<const Vec<dim>>(at), at += dim;
+  }
+  for (auto& [boundary, follow] : follows_) follow->from = Eigen::Map<const Vec<dim>>(at), at += dim;
+  std::copy(at, state.data() + size, kernel_.balance().begin());
+  flow_ = fluid_.projected();
+}
+
+template <int dim>
+std::vector<Vec<dim>> Coupling<dim>::fluid_velocity() {
+  std::vector<Vec<dim>> u(drag_.size());
+  for (std::size_t i = 0; i < u.size(); ++i) u[i] = at_grain(static_cast<int>(i), flow_.velocity);
+  return u;
+}
+
+template <int dim>
+std::vector<double> Coupling<dim>::void_fraction() {
+  std::vector<double> eps(drag_.size());
+  for (std::size_t i = 0; i < eps.size(); ++i) eps[i] = at_grain(static_cast<int>(i), eps_);
+  return eps;
+}
+
+template class Coupling<2>;
+template class Coupling<3>;
+
+}  // namespace quicksand::coupling

@@ -1,0 +1,127 @@
+// Fluid and grains together: unresolved FEM-DEM after the averaged equations of Anderson and Jackson, "model A". A step of dt:
+//   1. the mesh follows the walls, the void fraction is that of the grains where they are;
+//   2. the fluid makes its step. What it does to the grains is implicit in its velocity and pressure, and so is, as far as it can be known, what
+//      they do in answer: see below;
+//   3. the grains make theirs, in as many sub-steps as they need: drag implicit in the contact problem, pressure gradient and viscous stress given;
+//   4. what the grains got from drag and the fluid did not give, carry_i, is handed to the fluid in the next step: none is lost.
+// A grain's drag, linear about the slip s_0 that is expected, F = gamma (u - v - s), and the rest on it, R = m g - V grad p + V div(2 eta D(u)), move it
+// over dt in n sub-steps, were it free, such that drag's impulse is
+//   J/dt = c_gamma (u - s - v_0) - c R,   c = 1 - (1 - (1 + k/n)^-n)/k,   c_gamma = gamma (1 - c),   k = dt gamma/m.
+// Grains that bore no contact in the last step are taken so. Of others nothing is known: contacts may hold them, or whole clusters be free to go.
+//   J/dt = gamma (u - s - v_0) + c V (grad p - grad p before)
+// needs to know nothing. Of a mode of uniform motion, phases bound to each other by continuity or not, with grains free, held, or anything between, as
+// part of clusters of any mass, the amplification is at most 1 for k from 1e-3 to 1e6, densities of grains from 0.5 to 1000 times the fluid's and
+// solids up to 0.6, together with Fluid::grains_follow (and 1.3 up to 0.8 of light grains, if they are confined). Three things are needed for that:
+// the target v_0, for a free grain's answer given to a held one is explicit drag, unstable for k > 2; the answer to the pressure, c V; and that
+// continuity knows what follows the fluid: all grains but those that lean on a wall, by whatever chain of contacts. Theirs would be a false alarm
+// that swings on, in a bed with clear fluid above.
+#pragma once
+
+#include "drag.hpp"
+#include "kernel.hpp"
+
+#include "fluid/fluid.hpp"
+#include "grains/simulation.hpp"
+
+namespace quicksand::coupling {
+
+// gamma [kg/s] of spheres; one call for many.
+using DragLaw = std::function<void(std::span<const Suspension>, std::span<double> gamma)>;
+DragLaw of_each(double (*law)(const Suspension&));
+
+struct Settings {
+  Shape kernel = Shape::smooth;
+  double kernel_radius = 0.0;  // [m]
+  DragLaw drag;
+  Discs discs = Discs::spheres;
+  bool fluid_moves = true;     // false: it stays what it is, and feels no grain
+  bool grains_move = true;     // false: a bed that is held
+};
+
+template <int dim>
+struct Report {
+  double time = 0.0, dt = 0.0;              // of the grains [s]
+  StepReport<dim> grains;
+  fluid::Report fluid;
+  Vec<dim> drag = Vec<dim>::Zero();         // on all grains, mean over dt [N] (2D: N/m)
+  double exchanged_impulse = 0.0;           // sum of |J_i| [N s]
+  double carried_impulse = 0.0;             // |sum of carry_i| over it [-]
+  double disagreement = 0.0;                // sum of |carry_i| over it [-]
+  double momentum_error = 0.0;              // of fluid, grains and carried impulse, less boundaries and bodies, over it [-]
+  int removed = 0;                          // grains that left through outlets
+  double fluid_time = 0.0, grains_time = 0.0, exchange_time = 0.0;  // [s]
+};
+
+template <int dim>
+class Coupling {
+ public:
+  // Both stay the caller's, and must live on; forces and drag of the grains, void fraction and reaction of the fluid are set by this from now on.
+  Coupling(Simulation<dim>& grains, fluid::Fluid<dim>& fluid, Settings settings);
+
+  // A boundary of the mesh that goes with a wall of the grains, along the axes that are not periodic.
+  void follow(const std::string& boundary, int wall);
+  // Grains whose centre leaves the mesh by this boundary are removed; by another, step() throws.
+  void set_outlet(const std::string& boundary);
+
+  Report<dim> step(double dt);
+
+  // With the states of grains and fluid all that the next step depends on.
+  std::vector<double> state() const;
+  void restore(std::span<const double> state);
+
+  int removed() const { return removed_; }
+  // By id, of the last step.
+  const std::vector<Vec<dim>>& drag_force() const { return drag_force_; }        // mean over the step [N]
+  const std::vector<Vec<dim>>& stress_force() const { return stress_force_; }    // V (-grad p + div(2 eta D(u))) [N]
+  std::vector<Vec<dim>> fluid_velocity();                                        // u where each grain is [m/s]
+  std::vector<double> void_fraction();
+
+ private:
+  struct Follow {
+    int wall;
+    Vec<dim> from, velocity;  // where it was at the last step [m], and the boundary's velocity since [m/s]
+  };
+  struct Drag {        // on one grain: gamma (u - v - shift)
+    double gamma = 0.0;                    // [kg/s]
+    Vec<dim> shift = Vec<dim>::Zero();     // [m/s]
+  };
+  struct Answer {      // what the fluid takes J/dt to be: beta (u - shift - v) - given + yield (grad p - grad p before)
+    double beta, yield;                    // [kg/s], [m^dim]
+    Vec<dim> given;                        // [N]
+  };
+
+  void take_grains();
+  void locate();
+  double share_of(double k) const;
+  void expect_drag(double dt);
+  void linearise(const std::vector<int>& which, const std::vector<Vec<dim>>& slip, std::vector<double>& growth);
+  void set_reaction(double dt);
+  template <class T>
+  T at_grain(int i, const std::vector<T>& at_nodes) const;
+  double solid_volume_of(int i) const;
+
+  Simulation<dim>& grains_;
+  fluid::Fluid<dim>& fluid_;
+  Settings settings_;
+  std::shared_ptr<const Mesh<dim>> mesh_;
+  Walker<dim> walker_;
+  Kernel<dim> kernel_;
+  std::map<std::string, std::shared_ptr<Follow>> follows_;
+  std::vector<char> outlet_;       // of each boundary
+  typename fluid::Fluid<dim>::Projected flow_;
+  std::vector<double> eps_;        // at the nodes of the mesh
+
+  // Of grains, by id.
+  std::vector<Vec<dim>> x_, v_, carry_, drag_force_, stress_force_;
+  std::vector<double> r_, m_;
+  std::vector<Place<dim>> place_;
+  std::vector<char> free_;         // bore no contact in the last step
+  std::vector<std::uint8_t> held_; // by a wall, of each axis a bit
+  std::vector<Drag> drag_;
+  std::vector<Answer> answer_;
+  int sub_steps_ = 1;              // of the last step
+  bool started_ = false;           // the fluid's pressure is that of a flow with grains
+  int removed_ = 0;
+};
+
+}  // namespace quicksand::coupling

@@ -1,0 +1,342 @@
+"""Grains and fluid together: single grains, beds held and free, rest, settling; balances of each step."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from quicksand import coupling, fluid, grains, meshes
+from scenes import D, DENSITY, VISCOSITY, WATER, gamma, lattice, periodic_bed, simulation, superficial_velocity, volume
+
+GRAVITY = 9.81
+
+
+def falling_grain(dim, diameter, density, law, dt_over_tau, steps):
+    """One grain in a fluid that stays at rest: velocity after the steps, that of the law, and the time."""
+    down = [0.0] * (dim - 1) + [-GRAVITY]
+    box = 20 * diameter
+    flow = fluid.Fluid(meshes.box([box] * dim, size=box / 4), density=WATER, viscosity=VISCOSITY, gravity=down)
+    for boundary in flow.mesh.boundary_names:
+        flow.wall(boundary)
+    flow.solve_steady()
+    sim = grains.Simulation(dim=dim, gravity=down)
+    sim.set_friction("grain", "grain", 0.3)
+    middle = np.full((1, dim), box / 2)
+    sim.add(middle, diameter / 2, density=density)
+    solid = np.pi * diameter**3 / 6  # of the sphere that the law is of
+    weight = abs(density - WATER) * solid * GRAVITY
+
+    def drag(speed):
+        return speed * coupling.drag_coefficient(law, speed, 1.0, diameter, WATER, VISCOSITY)
+
+    terminal = brentq(lambda speed: drag(speed) - weight, 1e-9, 1e3, xtol=1e-16)
+    tau = density * solid * terminal / weight
+    both = coupling.Coupling(sim, flow, kernel="hat", drag=law, fluid_moves=False)
+    for _ in range(steps):
+        sim.position = middle
+        both.step(dt_over_tau * tau)
+    exact = solve_ivp(lambda t, v: (weight - drag(v[0])) / (density * solid), (0, steps * dt_over_tau * tau), [0.0], rtol=1e-10, atol=1e-14)
+    return abs(sim.velocity[0, -1]), terminal, exact.y[0, -1]
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("dt_over_tau", [0.01, 1.0, 100.0])
+@pytest.mark.parametrize("diameter, density", [(1e-4, 3000.0), (1e-3, 100.0), (2e-2, 3000.0)])  # Re about 1, 100, 2e4
+def test_a_grain_reaches_its_terminal_velocity(dim, dt_over_tau, diameter, density):
+    steps = max(20, round(20 / dt_over_tau))
+    speed, terminal, _ = falling_grain(dim, diameter, density, "di_felice", dt_over_tau, steps)
+    assert speed == pytest.approx(terminal, rel=1e-6)
+
+
+def test_glass_in_water_falls_as_published():
+    speed, _, _ = falling_grain(3, 1e-3, 2500.0, "di_felice", 1.0, 30)
+    assert speed == pytest.approx(0.1341, rel=1e-3)
+    speed, _, _ = falling_grain(3, 1e-3, 2500.0, "gidaspow", 1.0, 30)
+    assert speed == pytest.approx(0.1459, rel=1e-3)
+
+
+def test_the_way_to_the_terminal_velocity_is_of_first_order():
+    errors = []
+    for ratio in (0.04, 0.02):
+        speed, _, exact = falling_grain(3, 1e-3, 2500.0, "di_felice", ratio, round(0.5 / ratio))
+        errors.append(abs(speed - exact))
+    assert np.log2(errors[0] / errors[1]) > 0.9
+
+
+@pytest.mark.parametrize("law", ["di_felice", "gidaspow", "beetstra"])
+def test_dilute_drag_is_that_of_a_sphere_and_dense_drag_that_of_a_bed(law):
+    stokes = 3 * np.pi * VISCOSITY * D
+    assert coupling.drag_coefficient(law, 1e-9, 1.0, D, WATER, VISCOSITY) == pytest.approx(stokes, rel=0.05)
+    # Ergun's bed of spheres, viscous: drag per volume over the superficial velocity.
+    eps, slip = 0.4, 1e-7
+    bed = 150 * (1 - eps) ** 2 * VISCOSITY / (eps * D**2)
+    assert (1 - eps) / (np.pi * D**3 / 6) * coupling.drag_coefficient(law, slip, eps, D, WATER, VISCOSITY) == pytest.approx(bed, rel=0.25)
+
+
+def test_a_law_from_python_does_as_the_built_in_one():
+    def ergun(slip, eps, diameter, density, viscosity):
+        reynolds = density * eps * diameter * slip / viscosity
+        return np.pi * viscosity * diameter / eps * (25 * (1 - eps) + 1.75 / 6 * reynolds)
+
+    found = []
+    for law in ("gidaspow", ergun):
+        both, flow, dt, _ = periodic_bed(2, mesh_over_d=3, k=1.0, law=law)
+        for _ in range(3):
+            both.step(dt)
+        found.append(flow.velocity)
+    assert np.allclose(*found, rtol=1e-10, atol=1e-15)
+
+
+@pytest.mark.parametrize("dim, mesh_over_d, element", [(2, 0.5, "p1p1"), (2, 2, "p1p1"), (2, 6, "p1p1"), (2, 3, "p2p1"), (3, 2, "p1p1"), (3, 4, "p1p1")])
+def test_a_periodic_bed_has_the_pressure_gradient_of_the_law(dim, mesh_over_d, element):
+    both, flow, dt, gradient = periodic_bed(dim, mesh_over_d=mesh_over_d, k=1e4, element=element, side=12 if dim == 2 else 8)
+    driven = gradient(1e-4)
+    for _ in range(8):
+        report = both.step(dt)
+        assert report.momentum_error < 1e-12 and report.volume_error < 1e-12
+    n = len(flow.mesh.nodes)
+    if element == "p1p1":
+        assert driven == pytest.approx(gradient(superficial_velocity(flow)[0]), rel=5e-4)
+    assert np.abs(flow.velocity[:n, 1]).max() < 0.05 * flow.velocity[:n, 0].max()
+
+
+@pytest.mark.parametrize("k", [1e-2, 1.0, 1e2, 1e6])
+def test_flow_through_a_held_bed_settles_monotonically(k):
+    both, flow, dt, gradient = periodic_bed(2, mesh_over_d=3, k=k, law="gidaspow", velocity=1e-6)  # whose drag is linear below eps = 0.8, but for Re/100
+    speeds = []
+    for _ in range(10):
+        both.step(dt)
+        speeds.append(superficial_velocity(flow)[0])
+    assert all(b >= a * (1 - 2e-3) for a, b in zip(speeds, speeds[1:]))
+    if k >= 1:
+        assert speeds[-1] == pytest.approx(1e-6, rel=2e-3)
+
+
+@pytest.mark.parametrize("kernel", ["smooth", "hat"])
+@pytest.mark.parametrize("element", ["p1p1", "p2p1"])
+@pytest.mark.parametrize("grains_move", [True, False])
+def test_a_bed_at_rest_stays_at_rest(kernel, element, grains_move):
+    x = lattice((10, 8), (12 * D, 8 * D), (-6 * D, 0.0))
+    sim = simulation(2, x, period=(12 * D, None), gravity=(0, -GRAVITY), tolerance=1e-10)
+    sim.add_plane((0, 0), (0, 1))
+    mesh = meshes.box([12 * D, 24 * D], [4, 8], periodic=[True, False], origin=[-6 * D, 0.0])
+    flow = fluid.Fluid(mesh, density=WATER, viscosity=VISCOSITY, gravity=(0, -GRAVITY), element=element)
+    flow.wall("bottom"), flow.wall("top"), flow.mean_pressure(0.0)
+    both = coupling.Coupling(sim, flow, kernel=kernel, kernel_radius=1.5 * D, grains_move=grains_move)
+    for _ in range(10):
+        both.step(1e-3)
+    assert np.abs(flow.velocity).max() < 1e-11 and np.abs(sim.velocity).max() < 1e-11
+    assert flow.void_fraction.min() < 0.4 and flow.void_fraction.max() == 1.0
+
+
+def settling(k, phi_gap, steps, viscosity=1e-2):
+    """A block that falls in a closed box."""
+    width, height, block = 12 * D, 40 * D, 18 * D
+    counts = (int(12 / phi_gap), int(18 / phi_gap))
+    x = lattice(counts, (width, block), (-width / 2, height - block - 2 * D), jitter=0.6)
+    sim = simulation(2, x, period=(width, None), gravity=(0, -GRAVITY))
+    sim.add_plane((0, 0), (0, 1)), sim.add_plane((0, height), (0, -1))
+    flow = fluid.Fluid(meshes.box([width, height], [4, 13], periodic=[True, False], origin=[-width / 2, 0.0]), density=WATER, viscosity=viscosity, gravity=(0, -GRAVITY))
+    flow.wall("bottom"), flow.wall("top"), flow.mean_pressure(0.0)
+    both = coupling.Coupling(sim, flow, kernel_radius=1.5 * D)
+    dt = k * sim.mass[0] / gamma(2, 0.0, 0.3, viscosity=viscosity)
+    speeds, reports = [], []
+    for _ in range(steps):
+        reports.append(both.step(dt))
+        speeds.append(sim.velocity[:, 1].mean())
+    return np.array(speeds), reports, flow
+
+
+@pytest.mark.parametrize("k", [0.3, 3.0])
+@pytest.mark.parametrize("gap", [1.3, 1.05])  # solids 0.5 and 0.72: grains that all follow the fluid, which they drive in turn
+def test_a_dense_block_settles_without_swinging(k, gap):
+    speeds, reports, flow = settling(k, gap, 60)
+    late = speeds[20:]
+    assert late.max() < 0  # down, always
+    assert np.abs(np.diff(late)).max() < 0.25 * np.abs(late).mean()
+    assert np.abs(flow.velocity[:, 1]).max() < 0.03
+    for report in reports:
+        assert report.momentum_error < 1e-9 and report.volume_error < 1e-11
+
+
+def test_what_follows_the_fluid_is_what_keeps_a_dense_block_from_swinging():
+    """Without continuity's advance the same block swings ever wilder: the test above can fail."""
+    width, height = 12 * D, 40 * D
+    x = lattice((11, 17), (width, 18 * D), (-width / 2, 20 * D), jitter=0.6)
+    sim = simulation(2, x, period=(width, None), gravity=(0, -GRAVITY), accept_unconverged=True)
+    sim.add_plane((0, 0), (0, 1)), sim.add_plane((0, height), (0, -1))
+    flow = fluid.Fluid(meshes.box([width, height], [4, 13], periodic=[True, False], origin=[-width / 2, 0.0]), density=WATER, viscosity=1e-2, gravity=(0, -GRAVITY))
+    flow.wall("bottom"), flow.wall("top"), flow.mean_pressure(0.0)
+    both = coupling.Coupling(sim, flow, kernel_radius=1.5 * D)
+    flow.grains_follow = False
+    dt = 3.0 * sim.mass[0] / gamma(2, 0.0, 0.3, viscosity=1e-2)
+    speeds = []
+    for _ in range(40):
+        both.step(dt)
+        speeds.append(sim.velocity[:, 1].mean())
+    assert np.abs(np.diff(speeds[20:])).max() > 0.03
+
+
+def uniform_reading(mesh, spacing, radius, inside):
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    axes = [np.arange(a + spacing / 2, b, spacing) for a, b in zip(low, high)]
+    x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(low))
+    x = x[inside(x)]
+    dim, r = len(low), 0.2 * spacing
+    sim = grains.Simulation(dim=dim)
+    sim.set_friction("grain", "grain", 0.3)
+    sim.add(x, r, density=DENSITY)
+    flow = fluid.Fluid(mesh, density=WATER, viscosity=1.0)
+    for boundary in mesh.boundary_names:
+        flow.wall(boundary)
+    flow.mean_pressure(0.0)
+    both = coupling.Coupling(sim, flow, kernel_radius=radius, grains_move=False)
+    both.step(1.0)
+    solid = np.pi * r**2 if dim == 2 else 4 / 3 * np.pi * r**3
+    x = flow.nodes[mesh.elements]
+    shares = np.abs(np.linalg.det(x[:, 1:] - x[:, :1])) / (2 if dim == 2 else 6)
+    total = (shares * (1 - flow.void_fraction)[mesh.elements].mean(axis=1)).sum()
+    assert total == pytest.approx(len(sim.position) * solid, rel=1e-12)  # no volume is lost
+    return (1 - flow.void_fraction) / (solid / spacing**dim)
+
+
+@pytest.mark.parametrize("size", [0.3, 0.1, 0.05])
+def test_a_uniform_field_of_grains_reads_uniform_up_to_walls_and_corners(size):
+    reading = uniform_reading(meshes.box([1, 1], size=size), 0.01, 0.1, lambda x: np.full(len(x), True))
+    assert np.abs(reading - 1).max() < 0.01
+
+
+def test_it_does_in_a_cube():
+    reading = uniform_reading(meshes.box([1, 1, 1], [6, 6, 6]), 1 / 32, 0.12, lambda x: np.full(len(x), True))
+    assert np.abs(reading - 1).max() < 0.01
+
+
+def test_it_does_along_curved_walls():
+    size = 0.1
+    mesh = meshes.annulus(0.5, 1.5, size)
+    rim = 1.5 * np.cos(np.pi / round(2 * np.pi * 1.5 / size))  # inside of the polygon
+
+    def inside(x):
+        r = np.linalg.norm(x, axis=1)
+        return (r > 0.5) & (r < rim)
+
+    assert np.abs(uniform_reading(mesh, 0.01, 0.1, inside) - 1).max() < 0.05
+
+
+def test_a_run_that_is_restored_goes_on_bit_for_bit():
+    def scene():
+        x = lattice((9, 12), (12 * D, 15 * D), (-6 * D, 2 * D), jitter=0.6)
+        sim = simulation(2, x, period=(12 * D, None), gravity=(0, -GRAVITY))
+        floor, lid = sim.add_plane((0, 0), (0, 1)), sim.add_plane((0, 20 * D), (0, -1), load=(None, -1.0))
+        flow = fluid.Fluid(meshes.box([12 * D, 20 * D], [4, 7], periodic=[True, False], origin=[-6 * D, 0.0]), density=WATER, viscosity=VISCOSITY, gravity=(0, -GRAVITY))
+        flow.wall("bottom"), flow.permeable("top", pressure=0.0)
+        both = coupling.Coupling(sim, flow)
+        both.follow("top", lid), both.follow("bottom", floor)
+        return sim, flow, both
+
+    first = scene()
+    for _ in range(5):
+        first[2].step(1e-3)
+    kept = [part.state() for part in first]
+    for _ in range(5):
+        first[2].step(1e-3)
+    second = scene()
+    for part, state in zip(second, kept):
+        part.restore(state)
+    for _ in range(5):
+        second[2].step(1e-3)
+    for name in ("position", "velocity"):
+        assert np.array_equal(getattr(first[0], name), getattr(second[0], name))
+    for name in ("velocity", "pressure", "void_fraction", "nodes"):
+        assert np.array_equal(getattr(first[1], name), getattr(second[1], name))
+
+
+def test_a_lid_drains_what_the_pores_lose():
+    """A loaded lid presses a bed: through it flows what the domain loses, and the mesh stays with the lid."""
+    x = lattice((9, 12), (12 * D, 15 * D), (-6 * D, 0.0), jitter=0.6)
+    sim = simulation(2, x, period=(12 * D, None))
+    floor, lid = sim.add_plane((0, 0), (0, 1)), sim.add_plane((0, 15.5 * D), (0, -1), load=(None, -0.1))
+    flow = fluid.Fluid(meshes.box([12 * D, 15.5 * D], [4, 5], periodic=[True, False], origin=[-6 * D, 0.0]), density=WATER, viscosity=VISCOSITY)
+    flow.wall("bottom"), flow.permeable("top", pressure=0.0)
+    both = coupling.Coupling(sim, flow)
+    both.follow("top", lid), both.follow("bottom", floor)
+    drained, start = 0.0, lid.position[1]
+    for _ in range(50):
+        before = lid.position[1]
+        report = both.step(2e-3)
+        assert flow.nodes[:, 1].max() == pytest.approx(before, abs=1e-14)
+        drained += 2e-3 * flow.flux("top")
+        assert report.volume_error < 1e-12 and report.momentum_error < 1e-9
+    assert before < start - 0.3 * D
+    assert drained == pytest.approx(12 * D * (start - before), rel=1e-10)
+
+
+@pytest.mark.parametrize("kernel, jumps_on", [("smooth", False), ("hat", True)])
+def test_pressure_of_a_grain_that_crosses_an_element_face(kernel, jumps_on):
+    """d(eps)/dt makes pressure; that of the smooth kernel has no jump as the grain comes to another element."""
+    jumps, speed, way = [], 10 * D, 0.3 * D
+    for dt in (1e-3, 2.5e-4):
+        mesh = meshes.box([12 * D, 12 * D], [4, 4], origin=[-6 * D, -6 * D])
+        flow = fluid.Fluid(mesh, density=WATER, viscosity=VISCOSITY)
+        for boundary in mesh.boundary_names:
+            flow.wall(boundary)
+        flow.mean_pressure(0.0)
+        sim = simulation(2, np.array([[-way, 0.4 * D]]))
+        sim.velocity = np.array([[speed, 0.0]])
+        both = coupling.Coupling(sim, flow, kernel=kernel, kernel_radius=1.5 * D, drag=lambda slip, *_: 0 * slip)
+        pressures = []
+        crossing = round(way / (speed * dt))
+        for _ in range(crossing + 5):
+            both.step(dt)
+            pressures.append(flow.pressure)
+        jumps.append(np.abs(np.diff(pressures[crossing - 5:], axis=0)).max())
+
+    assert jumps[1] > 0.7 * jumps[0] if jumps_on else jumps[1] < 0.4 * jumps[0]
+
+
+def test_grains_leave_through_an_outlet_and_are_counted():
+    mesh = meshes.box([10 * D, 10 * D], [4, 4])
+    flow = fluid.Fluid(mesh, density=WATER, viscosity=VISCOSITY)
+    flow.wall("bottom"), flow.wall("top"), flow.inflow("left", (0.01, 0.0)), flow.outflow("right")
+    sim = simulation(2, np.array([[2 * D, 5 * D], [9 * D, 5 * D], [9 * D, 2 * D]]))
+    sim.velocity = np.full((3, 2), (0.02, 0.0))
+    both = coupling.Coupling(sim, flow, kernel_radius=1.5 * D)
+    both.outlet("right")
+    removed = sum(both.step(0.01).removed for _ in range(20))
+    assert removed == both.removed == 2 and sim.count == 1
+
+
+def test_what_cannot_be_is_named():
+    mesh = meshes.box([10 * D, 10 * D], [4, 4])
+    flow = fluid.Fluid(mesh, density=WATER, viscosity=VISCOSITY)
+    for boundary in mesh.boundary_names:
+        flow.wall(boundary)
+    flow.mean_pressure(0.0)
+    outside = simulation(2, np.array([[5 * D, 5 * D], [11 * D, 5 * D]]))
+    with pytest.raises(ValueError, match=r"grain 1 at .* outside the mesh, beyond boundary \"right\".*outlet"):
+        coupling.Coupling(outside, flow).step(1e-3)
+    sim = simulation(2, np.array([[5 * D, 5 * D]]))
+    with pytest.raises(ValueError, match="kernel must be one of"):
+        coupling.Coupling(sim, flow, kernel="gauss")
+    with pytest.raises(ValueError, match="drag must be one of"):
+        coupling.Coupling(sim, flow, drag="stokes")
+    with pytest.raises(ValueError, match="too small for elements"):
+        coupling.Coupling(sim, flow, kernel_radius=1e-2 * D)
+    with pytest.raises(ValueError, match="period along axis 0"):
+        coupling.Coupling(simulation(2, np.array([[5 * D, 5 * D]]), period=(10 * D, None)), flow)
+    with pytest.raises(ValueError, match="no grains yet"):
+        coupling.Coupling(grains.Simulation(dim=2), flow)
+    with pytest.raises(ValueError, match="3D, fluid in 2D"):
+        coupling.Coupling(simulation(3, np.array([[5 * D] * 3])), flow)
+    with pytest.raises(ValueError, match="must return an array of shape"):
+        coupling.Coupling(sim, flow, drag=lambda *given: 1.0).step(1e-3)
+    with pytest.raises(ValueError, match="drag law gives -1"):
+        coupling.Coupling(sim, flow, drag=lambda slip, *rest: 0 * slip - 1).step(1e-3)
+    both = coupling.Coupling(sim, flow)
+    with pytest.raises(ValueError, match="no such|known|left"):
+        both.outlet("lid")
+    with pytest.raises(ValueError, match="dt must be > 0"):
+        both.step(-1.0)
+    flow.scheme = "bdf2"
+    with pytest.raises(ValueError, match="backward_euler"):
+        both.step(1e-3)
