@@ -266,7 +266,7 @@ def test_a_lid_drains_what_the_pores_lose():
         report = both.step(2e-3)
         assert flow.nodes[:, 1].max() == pytest.approx(before, abs=1e-14)
         drained += 2e-3 * flow.flux("top")
-        assert report.volume_error < 1e-12 and report.momentum_error < 1e-9
+        assert report.volume_error < 1e-11 and report.momentum_error < 1e-9
     assert before < start - 0.3 * D
     assert drained == pytest.approx(12 * D * (start - before), rel=1e-10)
 
