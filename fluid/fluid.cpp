@@ -187,6 +187,7 @@ Report Fluid<dim>::step(double dt) {
     pore_volume_[0] = pore_volume(eps_[0]);
     for (std::size_t k = 0; k < conditions_.size(); ++k) swept_[0][k] = swept(static_cast<int>(k), dt);
     eps_change_[0] = eps_change(dt);
+    eps_slope_ = eps_slopes();
     x = solve_step(time_ + dt, time, report);
     account(report, x, time);
   } catch (...) {
@@ -292,6 +293,7 @@ Report Fluid<dim>::solve_steady() {
   std::fill(mesh_velocity_.begin(), mesh_velocity_.end(), Vec<dim>::Zero());
   eps_[2] = eps_[1] = eps_[0];
   pore_volume_.fill(pore_volume(eps_[0]));
+  eps_slope_ = eps_slopes();
   hold(time_);
   evaluate_outside(time_);
   std::vector<double> x = x_[0];

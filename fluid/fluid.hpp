@@ -151,6 +151,7 @@ class Fluid {
   void evaluate_outside(double t);
   template <int order>
   ElementInput<dim, order> input(int element) const;
+  std::vector<Vec<dim>> eps_slopes() const;
   std::vector<Vec<dim>> subscales(const std::vector<double>& x, const TimeWeights& time) const;
   template <int order>
   void scatter(int local, const ElementSystem<dim, order>& system);
@@ -186,6 +187,7 @@ class Fluid {
   std::vector<Vec<dim>> mesh_velocity_;            // of mesh nodes
   std::array<std::vector<double>, 3> eps_;         // at velocity nodes: now, one and two steps ago
   std::array<std::vector<double>, 2> x_;           // unknowns, Cartesian, after the last step and the one before
+  std::vector<Vec<dim>> eps_slope_;                // order 1: grad eps at the nodes, for the coming step [1/m]
   std::array<std::vector<Vec<dim>>, 2> subscale_;  // order 1: at quadrature points, after the last step and the one before [m/s]
   std::vector<double> guess_;                      // that advects
   std::array<double, 3> pore_volume_{};            // int eps: now, and one and two steps ago [m^dim]
