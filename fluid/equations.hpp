@@ -92,9 +92,8 @@ struct Stabilisation {
   double tau, bulk;
 };
 template <int dim, int order>
-Stabilisation<dim> stabilisation(const Geometry<dim>& g, const Properties<dim>& fluid, const Vec<dim>& u, double rate, double beta_over_eps, double eps_jump) {
+Stabilisation<dim> stabilisation(const Mat<dim>& m, const Properties<dim>& fluid, const Vec<dim>& u, double rate, double beta_over_eps, double eps_jump) {
   constexpr double growth = order == 1 ? 40.0 : dim == 2 ? 200.0 : 0.0;
-  const Mat<dim> m = metric<dim>(g);
   const double advective = fluid.density * fluid.density * u.dot(m * u);
   const double viscous = 9.0 * fluid.viscosity * fluid.viscosity * m.squaredNorm();
   const double steady = advective + viscous;
@@ -148,11 +147,12 @@ struct AtPoint {
     beside.setZero();
     for (int t = 0; t < 2; ++t)
       if (in.subscale[t]) beside += rho * time[t + 1] * in.subscale[t][q];
+    const Mat<dim> m = metric<dim>(g);
     eps_curvature.setZero();
     if constexpr (order == 1) {
       for (int a = 0; a < n; ++a) eps_curvature += 0.5 * (in.eps_slope[a] * grad[a].transpose() + grad[a] * in.eps_slope[a].transpose());
       // Where eps is not resolved, h^2 eps''/eps well above 1, it says little, and the subscales of it, some 1/17 of that times u, must not rule U.
-      const double steep = 2.0 * dim / metric<dim>(g).trace() * eps_curvature.norm() * inv_eps;
+      const double steep = 2.0 * dim / m.trace() * eps_curvature.norm() * inv_eps;
       eps_curvature /= 1.0 + steep * steep;
       // U bends where eps does and grains move: what they carry and U add up to a flux without divergence, U = Q - (1 - eps) v, and Q and v are taken to
       // be as smooth as they look: U'' = v eps''. Grains that nobody tells of go with the mesh.
@@ -160,7 +160,7 @@ struct AtPoint {
       beside -= fluid.viscosity * (eps_curvature * grains + eps_curvature.trace() * grains);
     }
     const auto [least, most] = std::minmax_element(in.eps[0].begin(), in.eps[0].end());
-    stab = stabilisation<dim, order>(g, fluid, relative, time[0], reaction.beta * inv_eps, (*most - *least) * inv_eps);
+    stab = stabilisation<dim, order>(m, fluid, relative, time[0], reaction.beta * inv_eps, (*most - *least) * inv_eps);
   }
 
   // What the viscous force -eps div(2 eta D(u)) is per unit of unknown b, column j by U_j: second derivatives of U/eps, U linear. Those of eps count as much

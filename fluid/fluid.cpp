@@ -190,6 +190,7 @@ Report Fluid<dim>::step(double dt) {
     eps_slope_ = eps_slopes();
     x = solve_step(time_ + dt, time, report);
     account(report, x, time);
+    judge_elements(report, x, dt);
   } catch (...) {
     position_ = old_position_, mesh_velocity_ = mesh_velocity;
     throw;
@@ -308,6 +309,7 @@ Report Fluid<dim>::solve_steady() {
     if (k == settings.max_newton) throw_newton("solve_steady", report);
   }
   account(report, x, time);
+  judge_elements(report, x, 0.0);
   subscale_[1] = subscale_[0] = subscales(x, time);
   x_[1] = x_[0] = x;
   time_weights_ = time;

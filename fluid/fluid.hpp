@@ -42,6 +42,10 @@ struct Report {
   double net_inflow = 0.0;       // through all boundaries relative to the mesh [m^dim/s]
   double pore_volume_rate = 0.0; // d/dt of int eps over the domain [m^dim/s]
   double volume_error = 0.0;     // of their balance, relative to the fastest flow through all of the boundary and all changes of eps [-]
+  // The largest of any element: of the flow relative to the mesh, at its middle, h the length of the element along it.
+  double courant = 0.0;          // |u - w| dt/h [-]; 0 where the flow is steady
+  double peclet = 0.0;           // rho |u - w| h/eta [-]
+  double eps_jump = 0.0;         // highest void fraction less the lowest, over the lowest [-]
   double assembly_time = 0.0, solve_time = 0.0;  // [s]
 };
 
@@ -173,6 +177,7 @@ class Fluid {
   double mean_pressure(const std::vector<double>& x) const;
   double relative_change(const std::vector<double>& x, const std::vector<double>& before) const;
   double flux_of(const std::vector<double>& x, int boundary) const;
+  void judge_elements(Report& report, const std::vector<double>& x, double dt) const;
   void account(Report& report, const std::vector<double>& x, const TimeWeights& time) const;
   [[noreturn]] void throw_newton(const char* function, const Report& report) const;
 
