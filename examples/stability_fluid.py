@@ -44,12 +44,14 @@ Keys of one case, relative to the exact value unless said:
 """
 
 import time
+import warnings
 from pathlib import Path
 
 import numpy as np
 
 from quicksand import fluid, meshes, study
 
+warnings.filterwarnings("ignore", "Fluid: the void fraction")  # steep ones are the case
 ELEMENTS = ("p1p1", "p2p1")
 MEASURED = ("section_error", "pressure_error", "overshoot", "flux_error", "away_error", "velocity_error", "fastest", "fastest_return", "change")
 COLOURS = ("#1f5fa8", "#c2452d", "#2e7d4f", "#8a5a00", "#222222", "#9aa5b1")

@@ -32,12 +32,31 @@ ElementInput<dim, order> Fluid<dim>::input(int element) const {
     in.flux[0][a] = Eigen::Map<const Vec<dim>>(&guess_[space_.first_dof[node]]);
     for (int t = 0; t < 2; ++t) in.flux[t + 1][a] = Eigen::Map<const Vec<dim>>(&x_[t][space_.first_dof[node]]);
   }
+  if constexpr (order == 1)
+    for (int a = 0; a < in.n; ++a) in.eps_slope[a] = eps_slope_[space_.node_of[element * in.n + a]];
   if (!reaction_.empty()) in.reaction = &reaction_[element * quadrature<dim, order>().size()];
   if constexpr (order == 1)
     for (int t = 0; t < 2; ++t) in.subscale[t] = &subscale_[t][element * quadrature<dim, 1>().size()];
   if (!advance_.empty()) in.advance = &advance_[element * quadrature<dim, order>().size()];
   in.advection = settings.advection != Advection::none;
   return in;
+}
+
+// grad eps at the nodes, the mean over the elements around by volume: of second order inside where they are alike.
+template <int dim>
+std::vector<Vec<dim>> Fluid<dim>::eps_slopes() const {
+  if (velocity_order() != 1) return {};
+  std::vector<Vec<dim>> slope(space_.nodes(), Vec<dim>::Zero());
+  std::vector<double> volume(space_.nodes(), 0.0);
+  for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
+    const int* node = &space_.node_of[e * (dim + 1)];
+    const Geometry<dim> g = geometry<dim>(position_, mesh_->elements[e]);
+    Vec<dim> here = Vec<dim>::Zero();
+    for (int a = 0; a <= dim; ++a) here += eps_[0][node[a]] * g.grad_l[a];
+    for (int a = 0; a <= dim; ++a) slope[node[a]] += g.volume * here, volume[node[a]] += g.volume;
+  }
+  for (int k = 0; k < space_.nodes(); ++k) slope[k] /= volume[k];
+  return slope;
 }
 
 // Of the flow x, at the quadrature points of all elements.

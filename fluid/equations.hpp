@@ -10,6 +10,8 @@
 
 #include "element.hpp"
 
+#include <algorithm>
+
 namespace quicksand::fluid {
 
 template <int dim>
@@ -45,6 +47,7 @@ struct ElementInput {
   std::array<Vec<dim>, dim + 1> x;                 // vertices [m]
   std::array<std::array<double, n>, 3> eps;        // now, and one and two steps ago, on the same material points of the mesh
   std::array<std::array<Vec<dim>, n>, 3> flux;     // U: [0] the guess that advects, then the past [m/s]
+  std::array<Vec<dim>, order == 1 ? n : 0> eps_slope;  // grad eps now, at the nodes: the mean of the elements around [1/m]
   std::array<Vec<dim>, dim + 1> mesh_velocity;     // [m/s]
   const Reaction<dim>* reaction = nullptr;         // at each quadrature point, or none
   std::array<const Vec<dim>*, 2> subscale{};       // order 1: one and two steps ago, at each quadrature point [m/s]; none: 0
@@ -68,25 +71,37 @@ struct ElementSystem {
   Eigen::Matrix<double, dofs, 1> b;
 };
 
+// 4/h^2 for a regular simplex of edge h: 2 |u|/sqrt(u . m u) is the length of the element along u [1/m^2].
+template <int dim>
+Mat<dim> metric(const Geometry<dim>& g) {
+  Mat<dim> m = Mat<dim>::Zero();
+  for (const Vec<dim>& grad : g.grad_l) m += 2.0 * grad * grad.transpose();
+  return m;
+}
+
 // The finer scales' own velocity U' [m/s], of which linear elements know nothing but this, at each quadrature point:
 //   rho dU'/dt + U'/tau = -(residual of the momentum),   U + U' is what continuity holds for.
 // It lives on from step to step, after R. Codina, J. Principe, O. Guasch and S. Badia, CMAME 196 (2007). Were it made anew in every step, with the
 // time step in tau, another time step would be another divergence of U, and cost a pressure of rho tau/dt times the residual.
 // 1/tau without time after Shakib, Hughes and Johan, CMAME 89 (1991), with the metric of the element, so that stretched elements are judged by the
-// direction of the flow; `tau` below [m^3 s/kg] is 1/(rho a[0] + 1/tau). And the bulk viscosity [Pa s] that goes with it: it knows neither the time
-// step nor beta: with them, it would lock the flow as they grow.
+// direction of the flow; `tau` below [m^3 s/kg] is 1/(rho a[0] + 1/tau).
+// And the bulk viscosity [Pa s], that of LSIC (order 1) or grad-div (order 2): it knows neither the time step nor beta: with them, it would lock the
+// flow as they grow. It acts as a pressure -bulk/eps (div U + d(eps)/dt) does, on div(eps w): so the pressure beyond a step of eps is right.
+// Where eps bends, viscous forces have the pressure jump by 2 eta [u'], where it curves, curve; what a continuous, linear pressure cannot follow is
+// left to div U, and bulk holds against it. It grows with the square of eps_jump, the change of eps over the element relative to eps: that vanishes
+// as h^2 where eps is resolved, so that orders stay. 200 with order 2, measured (docs/fluid.md): the flux through a plug is then right to 0.3 %; 100 misses
+// that, 400 makes velocities of a smooth flow (V1) worse by a fifth. 0 in 3D: fieldsplit does not bear more. 40 with order 1, which has eps'' as well.
 template <int dim>
 struct Stabilisation {
   double tau, bulk;
 };
-template <int dim>
-Stabilisation<dim> stabilisation(const Geometry<dim>& g, const Properties<dim>& fluid, const Vec<dim>& u, double rate, double beta_over_eps) {
-  Mat<dim> metric = Mat<dim>::Zero();  // 4/h^2 for a regular simplex of edge h
-  for (const Vec<dim>& grad : g.grad_l) metric += 2.0 * grad * grad.transpose();
-  const double advective = fluid.density * fluid.density * u.dot(metric * u);
-  const double viscous = 9.0 * fluid.viscosity * fluid.viscosity * metric.squaredNorm();
+template <int dim, int order>
+Stabilisation<dim> stabilisation(const Mat<dim>& m, const Properties<dim>& fluid, const Vec<dim>& u, double rate, double beta_over_eps, double eps_jump) {
+  constexpr double growth = order == 1 ? 40.0 : dim == 2 ? 200.0 : 0.0;
+  const double advective = fluid.density * fluid.density * u.dot(m * u);
+  const double viscous = 9.0 * fluid.viscosity * fluid.viscosity * m.squaredNorm();
   const double steady = advective + viscous;
-  return {1.0 / (fluid.density * rate + std::sqrt(steady + beta_over_eps * beta_over_eps)), std::sqrt(steady) / metric.trace()};
+  return {1.0 / (fluid.density * rate + std::sqrt(steady + beta_over_eps * beta_over_eps)), (1.0 + growth * eps_jump * eps_jump) * std::sqrt(steady) / m.trace()};
 }
 
 // All that a quadrature point knows before U and p are found.
@@ -103,7 +118,8 @@ struct AtPoint {
   Vec<dim> grad_eps, relative;           // u - w of the guess, which advects; 0 for Stokes
   Mat<dim> slope;                        // grad u of the guess, d u_i / d x_j
   Vec<dim> load;                         // the momentum's other side
-  Vec<dim> past_subscale;                // rho (a[1] U' + a[2] U'') of subscales one and two steps ago [N/m^3]
+  Mat<dim> eps_curvature;                // second derivatives of eps, of the slopes at nodes; order 1 only
+  Vec<dim> beside;                       // what only the subscales' residual has, and no unknown [N/m^3]
   Stabilisation<dim> stab;
 
   AtPoint(const ElementInput<dim, order>& in, const Geometry<dim>& g, const Properties<dim>& fluid, const TimeWeights& time, int q) {
@@ -137,19 +153,33 @@ struct AtPoint {
     const Vec<dim> past = time[1] * past_velocity + time[2] / eps_at[2] * flux[2];  // of du/dt
     load = eps * rho * (fluid.gravity - past) + reaction.beta_target + reaction.force;
     if (in.newton) load += rho * slope * flux[0];
-    past_subscale.setZero();
+    beside.setZero();
     for (int t = 0; t < 2; ++t)
-      if (in.subscale[t]) past_subscale += rho * time[t + 1] * in.subscale[t][q];
-    stab = stabilisation<dim>(g, fluid, relative, time[0], reaction.beta * inv_eps);
+      if (in.subscale[t]) beside += rho * time[t + 1] * in.subscale[t][q];
+    const Mat<dim> m = metric<dim>(g);
+    eps_curvature.setZero();
+    if constexpr (order == 1) {
+      for (int a = 0; a < n; ++a) eps_curvature += 0.5 * (in.eps_slope[a] * grad[a].transpose() + grad[a] * in.eps_slope[a].transpose());
+      // Where eps is not resolved, h^2 eps''/eps well above 1, it says little, and the subscales of it, some 1/17 of that times u, must not rule U.
+      const double steep = 2.0 * dim / m.trace() * eps_curvature.norm() * inv_eps;
+      eps_curvature /= 1.0 + steep * steep;
+      // U bends where eps does and grains move: what they carry and U add up to a flux without divergence, U = Q - (1 - eps) v, and Q and v are taken to
+      // be as smooth as they look: U'' = v eps''. Grains that nobody tells of go with the mesh.
+      const Vec<dim> grains = reaction.beta > 0 ? Vec<dim>(reaction.beta_target / reaction.beta) : mesh_velocity;
+      beside -= fluid.viscosity * (eps_curvature * grains + eps_curvature.trace() * grains);
+    }
+    const auto [least, most] = std::minmax_element(in.eps[0].begin(), in.eps[0].end());
+    stab = stabilisation<dim, order>(m, fluid, relative, time[0], reaction.beta * inv_eps, (*most - *least) * inv_eps);
   }
 
-  // What the viscous force -eps div(2 eta D(u)) is per unit of unknown b, column j by U_j: second derivatives of U/eps, U and eps linear, which do not
-  // vanish where eps varies. Order 1 only.
+  // What the viscous force -eps div(2 eta D(u)) is per unit of unknown b, column j by U_j: second derivatives of U/eps, U linear. Those of eps count as much
+  // as its slope squared; elements do not have them, but their neighbours' slopes do, as K. Jansen, S. Collis, C. Whiting and F. Shakib have it for
+  // velocities, CMAME 174 (1999). Order 1 only.
   Mat<dim> viscous(int b, double eta) const {
     static_assert(order == 1);
     const double inv_eps = 1.0 / eps;
     const Mat<dim> cross = grad[b] * grad_eps.transpose();
-    const Mat<dim> hessian = (2.0 * shape[b] * inv_eps * grad_eps * grad_eps.transpose() - cross - cross.transpose()) * (inv_eps * inv_eps);
+    const Mat<dim> hessian = (shape[b] * (2.0 * inv_eps * grad_eps * grad_eps.transpose() - eps_curvature) - cross - cross.transpose()) * (inv_eps * inv_eps);
     return -eps * eta * (hessian + hessian.trace() * Mat<dim>::Identity());
   }
 };
@@ -167,6 +197,7 @@ void element_system(const ElementInput<dim, order>& in, const Properties<dim>& f
     const auto& shape = at.shape;
     const auto& grad = at.grad;
     const Stabilisation<dim>& stab = at.stab;
+    const double bulk = stab.bulk / at.eps;
     std::array<Vec<dim>, n> grad_test;  // of eps w
     for (int a = 0; a < n; ++a) grad_test[a] = at.eps * grad[a] + shape[a] * at.grad_eps;
 
@@ -180,7 +211,7 @@ void element_system(const ElementInput<dim, order>& in, const Properties<dim>& f
         for (int i = 0; i < dim; ++i) {
           out.a(row + i, column + i) += diagonal;
           for (int j = 0; j < dim; ++j) {
-            double value = eta * at.grad_u[b][i] * grad_test[a][j] + stab.bulk * grad[a][i] * grad[b][j];
+            double value = eta * at.grad_u[b][i] * grad_test[a][j] + bulk * grad_test[a][i] * grad[b][j];
             if (in.newton) value += test * rho * shape[b] * at.slope(i, j);
             out.a(row + i, column + j) += weight * value;
           }
@@ -188,7 +219,7 @@ void element_system(const ElementInput<dim, order>& in, const Properties<dim>& f
       }
       for (int b = 0; b <= dim; ++b)
         for (int i = 0; i < dim; ++i) out.a(row + i, dof_of<dim>(b) + dim) += weight * test * at.drives * g.grad_l[b][i];
-      for (int i = 0; i < dim; ++i) out.b[row + i] += weight * (test * at.load[i] - stab.bulk * grad[a][i] * at.eps_rate);
+      for (int i = 0; i < dim; ++i) out.b[row + i] += weight * (test * at.load[i] - bulk * grad_test[a][i] * at.eps_rate);
     }
     for (int a = 0; a <= dim; ++a) {
       const int row = dof_of<dim>(a) + dim;
@@ -218,8 +249,8 @@ void element_system(const ElementInput<dim, order>& in, const Properties<dim>& f
           out.a.template block<1, dim>(row + dim, column) += test.transpose() * strong[b];
           out.a(row + dim, column + dim) += at.drives * test.dot(grad[b]);
         }
-        for (int i = 0; i < dim; ++i) out.b[row + i] -= along * at.past_subscale[i];
-        out.b[row + dim] += test.dot(at.load - at.past_subscale);
+        for (int i = 0; i < dim; ++i) out.b[row + i] -= along * at.beside[i];
+        out.b[row + dim] += test.dot(at.load - at.beside);
       }
     }
   }
@@ -231,7 +262,7 @@ void element_subscale(const ElementInput<dim, 1>& in, const Properties<dim>& flu
   const Geometry<dim> g = geometry<dim>(in.x);
   for (std::size_t q = 0; q < quadrature<dim, 1>().size(); ++q) {
     const AtPoint<dim, 1> at(in, g, fluid, time, static_cast<int>(q));
-    Vec<dim> residual = at.past_subscale - at.load;
+    Vec<dim> residual = at.beside - at.load;
     for (int b = 0; b <= dim; ++b) residual += at.drives * p[b] * at.grad[b] + at.inertia[b] * found[b] + at.viscous(b, fluid.viscosity) * found[b];
     out[q] = -at.stab.tau * residual;
   }

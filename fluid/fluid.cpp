@@ -224,8 +224,10 @@ Report Fluid<dim>::step(double dt) {
     pore_volume_[0] = pore_volume(eps_[0]);
     for (std::size_t k = 0; k < conditions_.size(); ++k) swept_[0][k] = swept(static_cast<int>(k), dt);
     eps_change_[0] = eps_change(dt);
+    eps_slope_ = eps_slopes();
     x = solve_step(time_ + dt, time, report);
     account(report, x, time);
+    judge_elements(report, x, dt);
   } catch (...) {
     for (Vec<dim>& a : advance_) a *= dt;
     undo_move();
@@ -376,6 +378,7 @@ Report Fluid<dim>::solve_steady() {
   std::fill(mesh_velocity_.begin(), mesh_velocity_.end(), Vec<dim>::Zero());
   eps_[2] = eps_[1] = eps_[0];
   pore_volume_.fill(pore_volume(eps_[0]));
+  eps_slope_ = eps_slopes();
   hold(time_);
   evaluate_outside(time_);
   std::vector<double> x = x_[0];
@@ -390,6 +393,7 @@ Report Fluid<dim>::solve_steady() {
     if (k == settings.max_newton) throw_newton("solve_steady", report);
   }
   account(report, x, time);
+  judge_elements(report, x, 0.0);
   subscale_[1] = subscale_[0] = subscales(x, time);
   x_[1] = x_[0] = x;
   time_weights_ = time;

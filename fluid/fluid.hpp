@@ -42,6 +42,10 @@ struct Report {
   double net_inflow = 0.0;       // through all boundaries relative to the mesh [m^dim/s]
   double pore_volume_rate = 0.0; // d/dt of int eps over the domain [m^dim/s]
   double volume_error = 0.0;     // of their balance, relative to the fastest flow through all of the boundary and all changes of eps [-]
+  // The largest of any element: of the flow relative to the mesh, at its middle, h the length of the element along it.
+  double courant = 0.0;          // |u - w| dt/h [-]; 0 where the flow is steady
+  double peclet = 0.0;           // rho |u - w| h/eta [-]
+  double eps_jump = 0.0;         // highest void fraction less the lowest, over the lowest [-]
   double assembly_time = 0.0, solve_time = 0.0;  // [s]
 };
 
@@ -171,6 +175,7 @@ class Fluid {
   void evaluate_outside(double t);
   template <int order>
   ElementInput<dim, order> input(int element) const;
+  std::vector<Vec<dim>> eps_slopes() const;
   std::vector<Vec<dim>> subscales(const std::vector<double>& x, const TimeWeights& time) const;
   void keep_advance();
   std::vector<Vec<dim>> advances(const std::vector<double>& x, double dt) const;
@@ -196,6 +201,7 @@ class Fluid {
   double mean_pressure(const std::vector<double>& x) const;
   double relative_change(const std::vector<double>& x, const std::vector<double>& before) const;
   double flux_of(const std::vector<double>& x, int boundary) const;
+  void judge_elements(Report& report, const std::vector<double>& x, double dt) const;
   void account(Report& report, const std::vector<double>& x, const TimeWeights& time) const;
   [[noreturn]] void throw_newton(const char* function, const Report& report) const;
 
@@ -211,6 +217,7 @@ class Fluid {
   double moved_for_ = 0.0;                         // length of the coming step where move() was called, else 0 [s]
   std::array<std::vector<double>, 3> eps_;         // at velocity nodes: now, one and two steps ago
   std::array<std::vector<double>, 2> x_;           // unknowns, Cartesian, after the last step and the one before
+  std::vector<Vec<dim>> eps_slope_;                // order 1: grad eps at the nodes, for the coming step [1/m]
   std::array<std::vector<Vec<dim>>, 2> subscale_;  // order 1: at quadrature points, after the last step and the one before [m/s]
   std::vector<Vec<dim>> advance_;                  // with grains_follow: dt a of the last step at quadrature points [m]
   std::vector<double> guess_;                      // that advects

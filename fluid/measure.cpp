@@ -53,6 +53,26 @@ void Fluid<dim>::account(Report& report, const std::vector<double>& x, const Tim
   report.volume_error = size > 0 ? std::abs(report.pore_volume_rate - report.net_inflow) / size : 0.0;
 }
 
+template <int dim>
+void Fluid<dim>::judge_elements(Report& report, const std::vector<double>& x, double dt) const {
+  double courant = 0.0, peclet = 0.0;  // squares
+  for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
+    Vec<dim> u = Vec<dim>::Zero();
+    double least = 1.0, most = 0.0;
+    for (int a = 0; a < space_.per_element; ++a) {
+      const int node = space_.node_of[e * space_.per_element + a];
+      least = std::min(least, eps_[0][node]), most = std::max(most, eps_[0][node]);
+      if (a <= dim) u += (Eigen::Map<const Vec<dim>>(&x[space_.first_dof[node]]) / eps_[0][node] - mesh_velocity_[mesh_->elements[e][a]]) / (dim + 1);
+    }
+    report.eps_jump = std::max(report.eps_jump, (most - least) / least);
+    const double per_time = u.dot(metric<dim>(geometry<dim>(position_, mesh_->elements[e])) * u) / 4;  // (|u|/h)^2
+    courant = std::max(courant, per_time);
+    if (per_time > 0) peclet = std::max(peclet, u.squaredNorm() * u.squaredNorm() / per_time);
+  }
+  report.courant = std::sqrt(courant) * dt;
+  report.peclet = properties.density * std::sqrt(peclet) / properties.viscosity;
+}
+
 // Calls use(point, force): what the fluid does to a boundary, the pressure at the facets' quadrature points, the viscous traction at nodes.
 // Where boundaries meet, each has its share of a node, by area.
 template <int dim>

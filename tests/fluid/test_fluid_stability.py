@@ -1,5 +1,7 @@
 """Small versions of examples/stability_fluid.py: where methods of this kind fail, and what is said there."""
 
+import warnings
+
 import numpy as np
 import pytest
 from quicksand import fluid, meshes
@@ -84,6 +86,26 @@ def test_pressure_survives_a_sudden_change_of_the_time_step(element):
     for dt in (1e-6, 1e-6, 1e-5, 1e-3):
         flow.step(dt)
         assert np.abs(flow.pressure - p).max() < 1e-4 * np.abs(p).max()
+
+
+@pytest.mark.parametrize("element", ELEMENTS)
+def test_reports_know_how_far_a_step_goes_and_how_steep_the_void_fraction_is(element):
+    """Uniform U = 2, h = 1/8: Courant number u dt/h, cell Peclet number rho u h/eta, both where u = U/eps is fastest, up to the mean over an element."""
+    for low in (0.5, 0.25):
+        mesh, flow = flow_in_box(element, density=3.0, viscosity=0.1)
+        for side in ("bottom", "top"):
+            flow.slip(side)
+        flow.inflow("left", [2.0, 0.0])
+        flow.outflow("right")
+        flow.void_fraction = np.where(mesh.nodes[:, 0] < 0.49, 1.0, low)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            reports = [flow.step(0.01), flow.step(0.02), flow.solve_steady()]
+        assert len(told) == (low < 1 / 3) and all("4-fold" in str(w.message) for w in told)
+        assert reports[0].eps_jump == pytest.approx(1 / low - 1)
+        fast = 2.0 / low  # the flux is right to 20 % in these two steps, and away from the jump
+        assert reports[1].courant == pytest.approx(fast * 0.02 * 8, rel=0.2) and reports[2].courant == 0.0
+        assert reports[1].peclet == pytest.approx(3.0 * fast / 8 / 0.1, rel=0.2)
 
 
 @pytest.mark.parametrize("element, largest", (("p1p1", 0.01), ("p2p1", 0.005)))

