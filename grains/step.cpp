@@ -48,16 +48,16 @@ StepReport<dim> Simulation<dim>::step(double dt) {
 
   for (double left = dt; left > 0;) {
     Motion motion = measure_pairs();
-    double h = sub_step_length(left, dt, motion);
+    double h = sub_step_length(left, dt, motion), gain = speed_gain(h);
     // How near a pair must be to touch in this sub-step: half as much again as the fastest of all neighbours moves relative to another,
     // for a grain may be pushed faster than any moved before. Pairs that are no neighbours yet must not come that near, by
     // their own motion and half of that.
-    auto alert = [&](double speed) { return 1.5 * h * (speed + speed_gain(h)) + 0.01 * mean_radius_; };
+    auto alert = [&](double speed) { return 1.5 * h * (speed + gain) + 0.01 * mean_radius_; };
     if (!neighbours_.valid(grains_, walls_, alert(motion.speed) / 3, h, threads_)) {
       neighbours_.find(grains_, walls_, box_, std::clamp(3 * alert(motion.speed), skin * mean_radius_, max_radius_ * 2), threads_);
       motion = measure_pairs();
-      h = sub_step_length(left, dt, motion);
-      while (!neighbours_.valid(grains_, walls_, alert(motion.speed) / 3, h, threads_)) h *= 0.5;
+      h = sub_step_length(left, dt, motion), gain = speed_gain(h);
+      while (!neighbours_.valid(grains_, walls_, alert(motion.speed) / 3, h, threads_)) h *= 0.5, gain = speed_gain(h);
     }
     const double overlap = motion.overlap, allowed = repair_above * settings.solve.tolerance * 2 * mean_radius_;
     if (overlap > allowed) {

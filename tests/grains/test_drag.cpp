@@ -219,32 +219,36 @@ TYPED_TEST(Drag, a_dragged_grain_rebounds_from_a_wall_with_both_restitutions) {
   }
 }
 
-// A heap that drag presses on a floor: many contacts a grain, packs of four in 2D. Where all grains slide or stick alike, velocities
-// are unique; they agree to a hundred times the tolerance, for residuals are local.
+// Columns side by side, thrown together and pressed on a floor: packs of four in 2D, both restitutions, slip and stick. In a column no
+// impulse can be traded for another, so velocities are unique (in a heap, dry or not, they need not be, and tight tolerances cycle).
 TYPED_TEST(Drag, every_solver_finds_the_same_velocities_under_mixed_drag) {
   constexpr int dim = TypeParam::value;
+  auto start = scene<dim>(0.3);
+  start.set_restitution("grain", "grain", 0.5, 0.2);
+  start.gravity = in_plane<dim>(0, -g);
+  start.add_plane(Vec<dim>::Zero(), in_plane<dim>(0, 1), "wall");
+  std::mt19937 random(3);
+  std::vector<double> k;
+  for (int column = 0; column < 12; ++column)
+    for (int layer = 0; layer < 6; ++layer) {
+      add<dim>(start, in_plane<dim>(3 * r * column, (2 * layer + 1) * r), r, random_vector<dim>(random, 0.05), turning<dim>(20.0 * column));
+      k.push_back(std::pow(10.0, (5 * layer + column) % 7 - 3));
+    }
+  set_drag<dim>(start, k, in_plane<dim>(0.02, -0.03));
   std::vector<std::vector<Vec<dim>>> found;
-  std::vector<char> start;
-  {
-    auto sim = dragged_gas<dim>(0.1);
-    sim.settings.solve.tolerance = 1e-6;
-    for (int n = 0; n < 200; ++n) sim.step(2 * h);
-    start = sim.state();
-  }
   for (const Solver solver : {Solver::nlgs, Solver::active_set, Solver::accelerated, Solver::newton, Solver::automatic}) {
-    auto sim = scene<dim>(0.0);
-    sim.restore(start);
+    auto sim = start;
     sim.settings.solver = solver;
-    sim.settings.solve.tolerance = 1e-10;
-    sim.settings.solve.max_sweeps = 200000;
-    const auto report = sim.step(h);
-    EXPECT_GT(report.contacts, 30);
+    sim.settings.solve.max_sweeps = 100000;
+    long contacts = 0;
+    for (int n = 0; n < 5; ++n) contacts += sim.step(h).contacts;
+    EXPECT_GT(contacts, 5 * 20);
     found.push_back(velocities(sim));
     const auto [problem, impulses] = sim.contact_problem();  // W of effective masses: its error is that of the step
     EXPECT_LT(global_error(problem, impulses), 1e-6);
   }
   for (const auto& v : found)
-    for (std::size_t k = 0; k < v.size(); ++k) EXPECT_LT((v[k] - found[0][k]).norm(), 1e-8) << k;
+    for (std::size_t i = 0; i < v.size(); ++i) EXPECT_LT((v[i] - found[0][i]).norm(), 1e-7) << i;  // residuals are local: tolerance x layers^2 x steps
 }
 
 TYPED_TEST(Drag, none_is_as_if_there_had_never_been_any_and_zero_drag_differs_by_rounding) {
