@@ -56,11 +56,6 @@ void Coupling<dim>::set_outlet(const std::string& boundary) {
 }
 
 template <int dim>
-double Coupling<dim>::solid_volume_of(int i) const {
-  return solid_volume<dim>(r_[i]);
-}
-
-template <int dim>
 void Coupling<dim>::take_grains() {
   x_ = grains_.by_id([&](const Grains<dim>& g, int k) { return walker_.wrap(g.x[k]); });
   v_ = grains_.by_id([](const Grains<dim>& g, int k) { return Vec<dim>(g.body[k].v); });
@@ -95,13 +90,21 @@ void Coupling<dim>::locate() {
   keep(x_), keep(v_), keep(r_), keep(m_), keep(carry_), keep(free_), keep(held_), keep(place_), keep(drag_), keep(answer_);
 }
 
+// What the flow is and does where each grain is.
 template <int dim>
-template <class T>
-T Coupling<dim>::at_grain(int i, const std::vector<T>& at_nodes) const {
-  const Weights<dim>& w = kernel_.weights();
-  T sum = w.weight[w.start[i]] * at_nodes[w.node[w.start[i]]];
-  for (int k = w.start[i] + 1; k < w.start[i + 1]; ++k) sum += w.weight[k] * at_nodes[w.node[k]];
-  return sum;
+void Coupling<dim>::tell_grains() {
+  using Values = Eigen::Matrix<double, 3 * dim + 1, 1>;
+  std::vector<Values> at_nodes(mesh_->nodes.size());
+  for (std::size_t k = 0; k < at_nodes.size(); ++k) at_nodes[k] << flow_.velocity[k], flow_.pressure_gradient[k], flow_.viscous_force[k], eps_[k];
+  const std::vector<Values> at_carriers = kernel_.to_carriers(at_nodes, Values(Values::Zero()));
+  const std::size_t n = x_.size();
+  u_.resize(n), grad_p_.resize(n), stress_force_.resize(n), eps_at_.resize(n);
+  for (std::size_t i = 0; i < n; ++i) {
+    const Values here = kernel_.at_grain(static_cast<int>(i), at_carriers);
+    u_[i] = here.template head<dim>(), grad_p_[i] = here.template segment<dim>(dim);
+    stress_force_[i] = solid_volume_of(static_cast<int>(i)) * (here.template segment<dim>(2 * dim) - grad_p_[i]);
+    eps_at_[i] = here[3 * dim];
+  }
 }
 
 // c of the text above.
@@ -118,7 +121,7 @@ void Coupling<dim>::linearise(const std::vector<int>& which, const std::vector<V
   std::vector<Suspension> seen;
   for (const double factor : {1.0, 1.0 + more})
     for (const int i : which) {
-      double eps = at_grain(i, eps_);
+      double eps = eps_at_[i];
       if (dim == 2 && settings_.discs == Discs::spheres) eps = void_fraction_of_spheres(eps);
       seen.push_back({2 * r_[i], eps, factor * slip[i].norm(), fluid_.properties.density, fluid_.properties.viscosity});
     }
@@ -138,10 +141,10 @@ void Coupling<dim>::linearise(const std::vector<int>& which, const std::vector<V
 template <int dim>
 void Coupling<dim>::expect_drag(double dt) {
   const int n = static_cast<int>(x_.size());
-  std::vector<Vec<dim>> u(n), slip(n);
+  std::vector<Vec<dim>> slip(n);
   std::vector<double> growth(n);
   std::vector<int> which(n);
-  for (int i = 0; i < n; ++i) u[i] = at_grain(i, flow_.velocity), slip[i] = u[i] - v_[i], which[i] = i;
+  for (int i = 0; i < n; ++i) slip[i] = u_[i] - v_[i], which[i] = i;
   for (int rounds = 0; !which.empty() && rounds < 30; ++rounds) {
     linearise(which, slip, growth);
     std::vector<int> again;
@@ -150,8 +153,8 @@ void Coupling<dim>::expect_drag(double dt) {
       const double k = dt * drag_[i].gamma / m_[i], left = std::exp(-sub_steps_ * std::log1p(k / sub_steps_));
       const Vec<dim> rest = m_[i] * grains_.gravity + stress_force_[i];
       // Without drag it would fall freely; with it, it tends to u - shift + rest/gamma.
-      const Vec<dim> end = k > 1e-8 ? Vec<dim>(u[i] - drag_[i].shift + rest / drag_[i].gamma) : Vec<dim>(v_[i] + dt / m_[i] * rest);
-      const Vec<dim> next = u[i] - (k > 1e-8 ? Vec<dim>(end + left * (v_[i] - end)) : end);
+      const Vec<dim> end = k > 1e-8 ? Vec<dim>(u_[i] - drag_[i].shift + rest / drag_[i].gamma) : Vec<dim>(v_[i] + dt / m_[i] * rest);
+      const Vec<dim> next = u_[i] - (k > 1e-8 ? Vec<dim>(end + left * (v_[i] - end)) : end);
       const double before = slip[i].norm(), after = next.norm();
       if (after > 2 * before || growth[i] * std::abs(after - before) > 0.03 * before) again.push_back(i);
       slip[i] = next;
@@ -162,29 +165,32 @@ void Coupling<dim>::expect_drag(double dt) {
 
 template <int dim>
 void Coupling<dim>::set_reaction(double dt) {
-  std::vector<fluid::Reaction<dim>> at_nodes(mesh_->nodes.size());
-  const Weights<dim>& w = kernel_.weights();
-  const std::vector<double>& mass = kernel_.masses();
+  using Values = Eigen::Matrix<double, 3 * dim + 2, 1>;  // beta, yield, beta target, force, follows
+  const Values zero = Values::Zero();
+  std::vector<Values> to_carriers(kernel_.carriers(), zero);
   for (std::size_t i = 0; i < x_.size(); ++i) {
+    const int k = static_cast<int>(i);
     const double gamma = drag_[i].gamma, c = settings_.grains_move ? share_of(dt * gamma / m_[i]) : 0.0;
     Answer& answer = answer_[i];
-    answer = {gamma, started_ ? c * solid_volume_of(static_cast<int>(i)) : 0.0, Vec<dim>::Zero()};
+    answer = {gamma, started_ ? c * solid_volume_of(k) : 0.0, Vec<dim>::Zero()};
     if (free_[i] && settings_.grains_move) {
       answer.beta = (1 - c) * gamma;
       answer.given = c * (m_[i] * grains_.gravity + stress_force_[i]);
     }
-    const Vec<dim> target = answer.beta * (v_[i] + drag_[i].shift);
-    const Vec<dim> force = answer.given + answer.yield * at_grain(static_cast<int>(i), flow_.pressure_gradient) + carry_[i] / dt;
-    for (int k = w.start[i]; k < w.start[i + 1]; ++k) {
-      fluid::Reaction<dim>& there = at_nodes[w.node[k]];
-      const double share = w.weight[k] / mass[w.node[k]];
-      there.beta += share * answer.beta, there.yield += share * answer.yield;
-      there.beta_target += share * target, there.force += share * force;
-      for (int axis = 0; axis < dim; ++axis)
-        if (!(held_[i] >> axis & 1)) there.follows[axis] += share * solid_volume_of(static_cast<int>(i));
-    }
+    Values values;
+    values << answer.beta, answer.yield, answer.beta * (v_[i] + drag_[i].shift), answer.given + answer.yield * grad_p_[i] + carry_[i] / dt, Vec<dim>::Zero();
+    for (int axis = 0; axis < dim; ++axis)
+      if (!(held_[i] >> axis & 1)) values[2 + 2 * dim + axis] = solid_volume_of(k);
+    kernel_.give(k, values, to_carriers);
   }
-  for (std::size_t k = 0; k < at_nodes.size(); ++k) at_nodes[k] = at_nodes[mesh_->master[k]];
+  const std::vector<Values> sums = kernel_.to_nodes(to_carriers, zero);
+  std::vector<fluid::Reaction<dim>> at_nodes(sums.size());
+  for (std::size_t k = 0; k < sums.size(); ++k) {
+    const Values density = sums[k] / kernel_.masses()[k];
+    at_nodes[k].beta = density[0], at_nodes[k].yield = density[1];
+    at_nodes[k].beta_target = density.template segment<dim>(2), at_nodes[k].force = density.template segment<dim>(2 + dim);
+    at_nodes[k].follows = density.template segment<dim>(2 + 2 * dim);
+  }
   fluid_.set_reaction(std::move(at_nodes));
 }
 
@@ -214,43 +220,39 @@ Report<dim> Coupling<dim>::step(double dt) {
   locate();
   report.removed = removed_ - before;
   const int n = static_cast<int>(x_.size());
-  const Weights<dim>& w = kernel_.weigh(x_, place_);
+  kernel_.weigh(x_, place_);
   if (settings_.fluid_moves) {
-    std::vector<double> solid(mesh_->nodes.size(), 0.0);
-    for (int i = 0; i < n; ++i)
-      for (int k = w.start[i]; k < w.start[i + 1]; ++k) solid[w.node[k]] += w.weight[k] * solid_volume_of(i);
-    eps_.resize(solid.size());
-    for (std::size_t k = 0; k < solid.size(); ++k) eps_[k] = 1 - solid[mesh_->master[k]] / kernel_.masses()[k];
+    std::vector<double> to_carriers(kernel_.carriers(), 0.0);
+    for (int i = 0; i < n; ++i) kernel_.give(i, solid_volume_of(i), to_carriers);
+    eps_ = kernel_.to_nodes(to_carriers, 0.0);
+    for (std::size_t k = 0; k < eps_.size(); ++k) eps_[k] = 1 - eps_[k] / kernel_.masses()[k];
     fluid_.set_void_fraction(eps_);
   } else {
+    flow_ = fluid_.projected();
     eps_ = fluid_.void_fraction();
+    eps_.resize(mesh_->nodes.size());
   }
-  if (!settings_.fluid_moves) flow_ = fluid_.projected();
-  stress_force_.resize(n);
-  auto stress = [&] {
-    for (int i = 0; i < n; ++i) stress_force_[i] = solid_volume_of(i) * (at_grain(i, flow_.viscous_force) - at_grain(i, flow_.pressure_gradient));
-  };
-  stress();
+  tell_grains();
   expect_drag(dt);
   Vec<dim> handed = Vec<dim>::Zero();
-  std::vector<Vec<dim>> pressure_before(n);
+  const std::vector<Vec<dim>> grad_p_before = grad_p_;
   if (settings_.fluid_moves) {
-    for (int i = 0; i < n; ++i) handed += carry_[i], pressure_before[i] = at_grain(i, flow_.pressure_gradient);
+    for (int i = 0; i < n; ++i) handed += carry_[i];
     set_reaction(dt);
     const double stepping = seconds();
     report.fluid = fluid_.step(dt);
     report.fluid_time = seconds() - stepping;
     flow_ = fluid_.projected();
-    stress();
+    tell_grains();
   }
   // Carried impulse is what the fluid gave, as its own answer has it, less what the grains got.
   Vec<dim> given = Vec<dim>::Zero();
   std::vector<double> gamma(n);
   std::vector<Vec<dim>> target(n);
   for (int i = 0; i < n; ++i) {
-    gamma[i] = drag_[i].gamma, target[i] = at_grain(i, flow_.velocity) - drag_[i].shift;
+    gamma[i] = drag_[i].gamma, target[i] = u_[i] - drag_[i].shift;
     if (!settings_.fluid_moves) continue;
-    carry_[i] = dt * (answer_[i].beta * (target[i] - v_[i]) - answer_[i].given + answer_[i].yield * (at_grain(i, flow_.pressure_gradient) - pressure_before[i]));
+    carry_[i] = dt * (answer_[i].beta * (target[i] - v_[i]) - answer_[i].given + answer_[i].yield * (grad_p_[i] - grad_p_before[i]));
     given += carry_[i];
   }
   drag_force_.resize(n);
@@ -303,15 +305,14 @@ std::vector<double> Coupling<dim>::state() const {
     all.insert(all.end(), carry_[i].data(), carry_[i].data() + dim);
   }
   for (const auto& [boundary, follow] : follows_) all.insert(all.end(), follow->from.data(), follow->from.data() + dim);
-  all.insert(all.end(), kernel_.balance().begin(), kernel_.balance().end());
   return all;
 }
 
 template <int dim>
 void Coupling<dim>::restore(std::span<const double> state) {
-  const std::size_t n = grains_.count(), size = 4 + n * (3 + dim) + follows_.size() * dim + kernel_.balance().size();
+  const std::size_t n = grains_.count(), size = 4 + n * (3 + dim) + follows_.size() * dim;
   if (state.size() != size || state[0] != static_cast<double>(n))
-    fail("restore: the state has {} numbers where {} grains, {} boundaries that follow walls and this mesh and kernel have {}; restore grains and fluid first, and call follow as "
+    fail("restore: the state has {} numbers where {} grains and {} boundaries that follow walls have {}; restore grains and fluid first, and call follow as "
          "before", state.size(), n, follows_.size(), size);
   const double* at = state.data() + 1;
   sub_steps_ = static_cast<int>(*at++), started_ = *at++ != 0.0, removed_ = static_cast<int>(*at++);
@@ -321,22 +322,7 @@ void Coupling<dim>::restore(std::span<const double> state) {
     carry_[i] = Eigen::Map<const Vec<dim>>(at), at += dim;
   }
   for (auto& [boundary, follow] : follows_) follow->from = Eigen::Map<const Vec<dim>>(at), at += dim;
-  std::copy(at, state.data() + size, kernel_.balance().begin());
   flow_ = fluid_.projected();
-}
-
-template <int dim>
-std::vector<Vec<dim>> Coupling<dim>::fluid_velocity() {
-  std::vector<Vec<dim>> u(drag_.size());
-  for (std::size_t i = 0; i < u.size(); ++i) u[i] = at_grain(static_cast<int>(i), flow_.velocity);
-  return u;
-}
-
-template <int dim>
-std::vector<double> Coupling<dim>::void_fraction() {
-  std::vector<double> eps(drag_.size());
-  for (std::size_t i = 0; i < eps.size(); ++i) eps[i] = at_grain(static_cast<int>(i), eps_);
-  return eps;
 }
 
 template class Coupling<2>;

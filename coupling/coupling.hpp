@@ -73,8 +73,8 @@ class Coupling {
   // By id, of the last step.
   const std::vector<Vec<dim>>& drag_force() const { return drag_force_; }        // mean over the step [N]
   const std::vector<Vec<dim>>& stress_force() const { return stress_force_; }    // V (-grad p + div(2 eta D(u))) [N]
-  std::vector<Vec<dim>> fluid_velocity();                                        // u where each grain is [m/s]
-  std::vector<double> void_fraction();
+  const std::vector<Vec<dim>>& fluid_velocity() const { return u_; }             // u where each grain is [m/s]
+  const std::vector<double>& void_fraction() const { return eps_at_; }
 
  private:
   struct Follow {
@@ -96,9 +96,8 @@ class Coupling {
   void expect_drag(double dt);
   void linearise(const std::vector<int>& which, const std::vector<Vec<dim>>& slip, std::vector<double>& growth);
   void set_reaction(double dt);
-  template <class T>
-  T at_grain(int i, const std::vector<T>& at_nodes) const;
-  double solid_volume_of(int i) const;
+  void tell_grains();
+  double solid_volume_of(int i) const { return solid_volume<dim>(r_[i]); }
 
   Simulation<dim>& grains_;
   fluid::Fluid<dim>& fluid_;
@@ -108,12 +107,13 @@ class Coupling {
   Kernel<dim> kernel_;
   std::map<std::string, std::shared_ptr<Follow>> follows_;
   std::vector<char> outlet_;       // of each boundary
-  typename fluid::Fluid<dim>::Projected flow_;
-  std::vector<double> eps_;        // at the nodes of the mesh
+  typename fluid::Fluid<dim>::Projected flow_;  // at the nodes of the mesh
+  std::vector<double> eps_;
 
   // Of grains, by id.
   std::vector<Vec<dim>> x_, v_, carry_, drag_force_, stress_force_;
-  std::vector<double> r_, m_;
+  std::vector<Vec<dim>> u_, grad_p_;  // where the grain is, with its own weights
+  std::vector<double> r_, m_, eps_at_;
   std::vector<Place<dim>> place_;
   std::vector<char> free_;         // bore no contact in the last step
   std::vector<std::uint8_t> held_; // by a wall, of each axis a bit

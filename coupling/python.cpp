@@ -103,8 +103,8 @@ void bind(py::module_& m, const char* suffix) {
       .def_property_readonly("removed", &C::removed, "grains that left through outlets so far")
       .def_property_readonly("drag_force", [](const C& c) { return to_numpy(c.drag_force()); }, "on each grain, mean over the last step (n, dim) [N] (2D: N/m)")
       .def_property_readonly("stress_force", [](const C& c) { return to_numpy(c.stress_force()); }, "volume times (-grad p + div(2 eta D(u))) of each grain (n, dim) [N] (2D: N/m)")
-      .def_property_readonly("fluid_velocity", [](C& c) { return to_numpy(c.fluid_velocity()); }, "where each grain is (n, dim) [m/s]")
-      .def_property_readonly("void_fraction", [](C& c) { return to_numpy(c.void_fraction()); }, "where each grain is (n,)");
+      .def_property_readonly("fluid_velocity", [](const C& c) { return to_numpy(c.fluid_velocity()); }, "where each grain is (n, dim) [m/s]")
+      .def_property_readonly("void_fraction", [](const C& c) { return to_numpy(c.void_fraction()); }, "where each grain is (n,)");
 }
 
 }  // namespace

@@ -80,8 +80,8 @@ THESIS = {  # table 3.1, mean (std); where these flags have their defaults
 }
 
 
-def command_line():
-    parser = study.Parser(__doc__, out="out/dry_couette", dt=1e-3, t_end=10.0, quick_t_end=2.0)
+def command_line(doc=__doc__, out="out/dry_couette"):
+    parser = study.Parser(doc, out=out, dt=1e-3, t_end=10.0, quick_t_end=2.0)
     parser.flag("--rate", type=study.number("1/s", above=0), default=10.0)
     parser.flag("--pressure", type=study.number("Pa", above=0), default=5.0)
     parser.flag("--size-ratio", type=study.number("", at_least=1), default=1.0)
@@ -166,23 +166,32 @@ class Scene:
         return np.concatenate(moved), np.full(sum(map(len, moved)), RADIUS)
 
 
+def profiles_of(flags):
+    return grains.Profiles(axis=1, bins=max(20, round(flags.height / (2 * RADIUS))), cross_section=flags.width)
+
+
+def record(run, scene, report, flags):
+    """The grains' part of the sample of a step."""
+    lower, upper = scene.walls
+    low, high = scene.faces
+    area = flags.width * (high - low)
+    stress = report.virial_contacts / area
+    run.record(h=high - low, phi=scene.solid / area, tau=stress[0, 1], sigma_xx=stress[0, 0], sigma_yy=stress[1, 1],
+               mu=abs(stress[0, 1] / stress[1, 1]) if stress[1, 1] else np.nan,
+               sigma_yy_wall_contacts=report.virial_wall_contacts[1, 1] / area,
+               sigma_yy_kinetic=report.virial_kinetic[1, 1] / area,
+               wall_pressure=(upper.force[1] - lower.force[1]) / (2 * flags.width),
+               branch_length=report.branch_length or np.nan, coordination=report.coordination)
+
+
 def simulate(scene, flags):
     """Step to the end; every time step leaves a sample in the run, every tenth a profile."""
-    run = study.Run(scene.sim, flags.dt, flags.t_end)
-    profiles = grains.Profiles(axis=1, bins=max(20, round(flags.height / (2 * RADIUS))), cross_section=flags.width)
+    run, profiles = study.Run(scene.sim, flags.dt, flags.t_end), profiles_of(flags)
     run.keep(flags, profiles=profiles, rng=scene.rng)
-    lower, upper = scene.walls
     for report in run:
-        low, high = scene.faces
-        area = flags.width * (high - low)
-        stress = report.virial_contacts / area
-        run.record(h=high - low, phi=scene.solid / area, tau=stress[0, 1], sigma_xx=stress[0, 0], sigma_yy=stress[1, 1],
-                   mu=abs(stress[0, 1] / stress[1, 1]) if stress[1, 1] else np.nan,
-                   sigma_yy_wall_contacts=report.virial_wall_contacts[1, 1] / area,
-                   sigma_yy_kinetic=report.virial_kinetic[1, 1] / area,
-                   wall_pressure=(upper.force[1] - lower.force[1]) / (2 * flags.width),
-                   branch_length=report.branch_length or np.nan, coordination=report.coordination)
+        record(run, scene, report, flags)
         if run.samples % PROFILE_EVERY == 0:
+            low, high = scene.faces
             profiles.sample(scene.sim, low, high)
         if flags.fixed_height and scene.sim.time > scene.closing_until - flags.dt / 2:
             scene.hold_height()

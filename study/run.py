@@ -35,6 +35,8 @@ class Run:
     sim : quicksand.grains.Simulation
     dt, t_end : float
         Time step and end [s]; the number of steps is t_end / dt, rounded.
+    stepper : quicksand.coupling.Coupling, optional
+        What makes the steps, where it is not `sim` by itself.
 
     Raises
     ------
@@ -42,10 +44,10 @@ class Run:
         When dt <= 0, t_end < dt, or either is not finite.
     """
 
-    def __init__(self, sim, dt, t_end):
+    def __init__(self, sim, dt, t_end, stepper=None):
         if not (0 < dt <= t_end < math.inf):
             raise ValueError(f"Run: dt must be > 0 s and t_end at least dt, got dt = {dt:g} s and t_end = {t_end:g} s")
-        self.sim, self.dt = sim, dt
+        self.sim, self.dt, self.stepper = sim, dt, stepper or sim
         self.steps = round(t_end / dt)
         self.samples = 0  # steps made so far
         self.wall_time = 0.0  # spent in stepping [s]
@@ -62,10 +64,11 @@ class Run:
                 self._files.before_first_step(self)
             while self.samples < self.steps and not self.interrupted:
                 start = time.perf_counter()
-                report = self.sim.step(self.dt)
+                report = self.stepper.step(self.dt)
                 self.wall_time += time.perf_counter() - start
                 self.samples += 1
-                self.record(**{name: getattr(report, name) for name in REPORTED})
+                of_grains = getattr(report, "grains", report)
+                self.record(**{name: getattr(of_grains, name) for name in REPORTED})
                 yield report
                 if self._files:
                     self._files.after_step(self)
@@ -87,8 +90,8 @@ class Run:
         flags : argparse.Namespace
             Of `study.Parser`: out, restart, frame_every, checkpoint_every, and all others as the parameters of the run.
         **parts
-            What changes during the run beside the simulation: random generators of numpy, and objects with `state()`, a dict of
-            arrays, and `restore(state)`.
+            What changes during the run beside the simulation: random generators of numpy, and objects with `state()`, an array or a dict
+            of arrays, and `restore(state)`. They are restored in this order. Those with `frame()` are in the frames, too.
         """
         self._files = _Files(self, flags, parts)
 
@@ -150,6 +153,7 @@ class _Files:
         self.parameters = json.dumps({name: str(value) if isinstance(value, Path) else value for name, value in vars(flags).items()})
         self.frame_steps = max(round(flags.frame_every / run.dt), 1) if flags.frame_every > 0 else 0
         self.checkpoint_every = flags.checkpoint_every
+        self.shown = [part for part in parts.values() if hasattr(part, "frame")]
         self.written = 0  # samples that are in frames
         count = self._restore(run, flags.restart) if flags.restart else 0
         self.frames = Frames(flags.out, self.parameters, count) if self.frame_steps else None
@@ -157,11 +161,11 @@ class _Files:
 
     def before_first_step(self, run):
         if self.frames and run.samples == 0:
-            self.frames.write(run.sim)
+            self.frames.write(run.sim, *self.shown)
 
     def after_step(self, run):
         if self.frames and run.samples % self.frame_steps == 0:
-            self.frames.write(run.sim, series={name: run[name][self.written:] for name in run.names})
+            self.frames.write(run.sim, *self.shown, series={name: run[name][self.written:] for name in run.names})
             self.written = run.samples
         if 0 < self.checkpoint_every <= time.monotonic() - self.last:
             self._checkpoint(run)
@@ -176,7 +180,8 @@ class _Files:
                          "frames": self.frames.count if self.frames else 0}}
         for name, part in self.parts.items():
             random = isinstance(part, np.random.Generator)
-            parts[name] = {"state": json.dumps(part.bit_generator.state)} if random else part.state()
+            state = json.dumps(part.bit_generator.state) if random else part.state()
+            parts[name] = state if isinstance(state, dict) else {"state": state}
         write_checkpoint(self.path, self.parameters, parts)
         self.last = time.monotonic()
 
@@ -188,7 +193,7 @@ class _Files:
             if isinstance(part, np.random.Generator):
                 part.bit_generator.state = json.loads(bytes(state["state"]))
             else:
-                part.restore(state)
+                part.restore(state["state"] if state.keys() == {"state"} else state)
         run.samples, run.wall_time = int(parts["run"]["samples"]), float(parts["run"]["wall_time"])
         run._series = dict(parts.get("series", {}))
         self.written = int(parts["run"]["written"])
