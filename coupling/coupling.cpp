@@ -22,9 +22,9 @@ DragLaw of_each(double (*law)(const Suspension&)) {
 }
 
 template <int dim>
-Coupling<dim>::Coupling(Simulation<dim>& grains, fluid::Fluid<dim>& fluid, Settings settings)
-    : grains_(grains), fluid_(fluid), settings_(std::move(settings)), mesh_(fluid.space().mesh), walker_(mesh_, grains.box().period),
-      kernel_(mesh_, settings_.kernel, settings_.kernel_radius, grains.box().period), outlet_(mesh_->boundary_names.size(), false) {
+Coupling<dim>::Coupling(Simulation<dim>& grains, fluid::Fluid<dim>& fluid, Settings the_settings)
+    : settings(std::move(the_settings)), grains_(grains), fluid_(fluid), mesh_(fluid.space().mesh), walker_(mesh_, grains.box().period),
+      kernel_(mesh_, settings.kernel, settings.kernel_radius, grains.box().period), outlet_(mesh_->boundary_names.size(), false) {
   const Vec<dim>& period = grains.box().period;
   Vec<dim> low = mesh_->nodes[0], high = low, shift = Vec<dim>::Zero();
   for (const Vec<dim>& x : mesh_->nodes) low = low.cwiseMin(x), high = high.cwiseMax(x);
@@ -35,9 +35,9 @@ Coupling<dim>::Coupling(Simulation<dim>& grains, fluid::Fluid<dim>& fluid, Setti
     if (period[k] > 0 && std::abs(high[k] - low[k] - period[k]) > 1e-9 * period[k])
       fail("Coupling: the mesh must extend over one period along axis {}, {} m, but does over {}", k, period[k], high[k] - low[k]);
   }
-  if (settings_.fluid_moves) {
+  if (settings.fluid_moves) {
     fluid_.settings.scheme = fluid::Scheme::backward_euler;
-    fluid_.grains_follow = settings_.grains_move;
+    fluid_.grains_follow = settings.grains_move;
   }
   flow_ = fluid_.projected();
 }
@@ -122,17 +122,17 @@ void Coupling<dim>::linearise(const std::vector<int>& which, const std::vector<V
   for (const double factor : {1.0, 1.0 + more})
     for (const int i : which) {
       double eps = eps_at_[i];
-      if (dim == 2 && settings_.discs == Discs::spheres) eps = void_fraction_of_spheres(eps);
+      if (dim == 2 && settings.discs == Discs::spheres) eps = void_fraction_of_spheres(eps);
       seen.push_back({2 * r_[i], eps, factor * slip[i].norm(), fluid_.properties.density, fluid_.properties.viscosity});
     }
   std::vector<double> gamma(seen.size());
-  settings_.drag(seen, gamma);
+  settings.drag(seen, gamma);
   for (std::size_t k = 0; k < which.size(); ++k) {
     const int i = which[k];
     if (!(gamma[k] >= 0 && std::isfinite(gamma[k])))
       fail("Coupling: the drag law gives {} kg/s for grain {}: slip {} m/s, void fraction {}, diameter {} m", gamma[k], i, seen[k].slip, seen[k].eps, seen[k].diameter);
     growth[i] = gamma[k] > 0 ? std::clamp(std::log(gamma[which.size() + k] / gamma[k]) / std::log1p(more), 0.0, 2.0) : 0.0;
-    const double scale = dim == 2 ? per_depth(settings_.discs, 2 * r_[i]) : 1.0;
+    const double scale = dim == 2 ? per_depth(settings.discs, 2 * r_[i]) : 1.0;
     drag_[i] = {scale * gamma[k] * (1 + growth[i]), slip[i] * (growth[i] / (1 + growth[i]))};
   }
 }
@@ -149,7 +149,7 @@ void Coupling<dim>::expect_drag(double dt) {
     linearise(which, slip, growth);
     std::vector<int> again;
     for (const int i : which) {
-      if (!free_[i] || !settings_.grains_move) continue;
+      if (!free_[i] || !settings.grains_move) continue;
       const double k = dt * drag_[i].gamma / m_[i], left = std::exp(-sub_steps_ * std::log1p(k / sub_steps_));
       const Vec<dim> rest = m_[i] * grains_.gravity + stress_force_[i];
       // Without drag it would fall freely; with it, it tends to u - shift + rest/gamma.
@@ -164,24 +164,38 @@ void Coupling<dim>::expect_drag(double dt) {
 }
 
 template <int dim>
+void Coupling<dim>::answer_as_expected(double dt) {
+  for (std::size_t i = 0; i < x_.size(); ++i) {
+    const double gamma = drag_[i].gamma, c = settings.grains_move ? share_of(dt * gamma / m_[i]) : 0.0;
+    answer_[i] = {gamma, started_ ? c * solid_volume_of(static_cast<int>(i)) : 0.0, v_[i], Vec<dim>::Zero(), grad_p_[i]};
+    if (!free_[i] || !settings.grains_move) continue;
+    answer_[i].beta = (1 - c) * gamma;
+    answer_[i].given = c * (m_[i] * grains_.gravity + stress_force_[i]);
+  }
+}
+
+// Of grains that contacts moved, about what they did: v is their velocity as drag felt it, mean over the step.
+template <int dim>
+void Coupling<dim>::answer_as_last(double dt) {
+  for (std::size_t i = 0; i < x_.size(); ++i) {
+    if (free_[i] || drag_[i].gamma == 0) continue;
+    answer_[i].beta = drag_[i].gamma, answer_[i].given.setZero();
+    answer_[i].v = target_[i] - drag_force_[i] / (dt * drag_[i].gamma), answer_[i].grad_p = grad_p_[i];
+  }
+}
+
+template <int dim>
 void Coupling<dim>::set_reaction(double dt) {
   using Values = Eigen::Matrix<double, 3 * dim + 2, 1>;  // beta, yield, beta target, force, follows
   const Values zero = Values::Zero();
   std::vector<Values> to_carriers(kernel_.carriers(), zero);
   for (std::size_t i = 0; i < x_.size(); ++i) {
-    const int k = static_cast<int>(i);
-    const double gamma = drag_[i].gamma, c = settings_.grains_move ? share_of(dt * gamma / m_[i]) : 0.0;
-    Answer& answer = answer_[i];
-    answer = {gamma, started_ ? c * solid_volume_of(k) : 0.0, Vec<dim>::Zero()};
-    if (free_[i] && settings_.grains_move) {
-      answer.beta = (1 - c) * gamma;
-      answer.given = c * (m_[i] * grains_.gravity + stress_force_[i]);
-    }
+    const Answer& answer = answer_[i];
     Values values;
-    values << answer.beta, answer.yield, answer.beta * (v_[i] + drag_[i].shift), answer.given + answer.yield * grad_p_[i] + carry_[i] / dt, Vec<dim>::Zero();
+    values << answer.beta, answer.yield, answer.beta * (answer.v + drag_[i].shift), answer.given + answer.yield * answer.grad_p + carry_[i] / dt, Vec<dim>::Zero();
     for (int axis = 0; axis < dim; ++axis)
-      if (!(held_[i] >> axis & 1)) values[2 + 2 * dim + axis] = solid_volume_of(k);
-    kernel_.give(k, values, to_carriers);
+      if (!(held_[i] >> axis & 1)) values[2 + 2 * dim + axis] = solid_volume_of(static_cast<int>(i));
+    kernel_.give(static_cast<int>(i), values, to_carriers);
   }
   const std::vector<Values> sums = kernel_.to_nodes(to_carriers, zero);
   std::vector<fluid::Reaction<dim>> at_nodes(sums.size());
@@ -197,8 +211,8 @@ void Coupling<dim>::set_reaction(double dt) {
 template <int dim>
 Report<dim> Coupling<dim>::step(double dt) {
   if (!(dt > 0 && std::isfinite(dt))) fail("step: dt must be > 0 s and finite, got {}", dt);
-  if (settings_.grains_move) grains_.check(dt);
-  if (settings_.fluid_moves && fluid_.settings.scheme != fluid::Scheme::backward_euler)
+  if (settings.grains_move) grains_.check(dt);
+  if (settings.fluid_moves && fluid_.settings.scheme != fluid::Scheme::backward_euler)
     fail("step: the fluid's scheme must be backward_euler when it is coupled: grains are of first order, and volumes add up only then");
   Report<dim> report;
   report.dt = dt;
@@ -221,7 +235,7 @@ Report<dim> Coupling<dim>::step(double dt) {
   report.removed = removed_ - before;
   const int n = static_cast<int>(x_.size());
   kernel_.weigh(x_, place_);
-  if (settings_.fluid_moves) {
+  if (settings.fluid_moves) {
     std::vector<double> to_carriers(kernel_.carriers(), 0.0);
     for (int i = 0; i < n; ++i) kernel_.give(i, solid_volume_of(i), to_carriers);
     eps_ = kernel_.to_nodes(to_carriers, 0.0);
@@ -234,67 +248,84 @@ Report<dim> Coupling<dim>::step(double dt) {
   }
   tell_grains();
   expect_drag(dt);
+  answer_as_expected(dt);
+  const bool again = settings.fluid_moves && settings.grains_move && std::isfinite(settings.tolerance);
+  if (again) fluid_.mark();
+  const std::vector<char> grains_before = again ? grains_.state() : std::vector<char>{};
   Vec<dim> handed = Vec<dim>::Zero();
-  const std::vector<Vec<dim>> grad_p_before = grad_p_;
-  if (settings_.fluid_moves) {
-    for (int i = 0; i < n; ++i) handed += carry_[i];
-    set_reaction(dt);
-    const double stepping = seconds();
-    report.fluid = fluid_.step(dt);
-    report.fluid_time = seconds() - stepping;
-    flow_ = fluid_.projected();
-    tell_grains();
-  }
-  // Carried impulse is what the fluid gave, as its own answer has it, less what the grains got.
-  Vec<dim> given = Vec<dim>::Zero();
-  std::vector<double> gamma(n);
-  std::vector<Vec<dim>> target(n);
-  for (int i = 0; i < n; ++i) {
-    gamma[i] = drag_[i].gamma, target[i] = u_[i] - drag_[i].shift;
-    if (!settings_.fluid_moves) continue;
-    carry_[i] = dt * (answer_[i].beta * (target[i] - v_[i]) - answer_[i].given + answer_[i].yield * (grad_p_[i] - grad_p_before[i]));
-    given += carry_[i];
-  }
-  drag_force_.resize(n);
-  Vec<dim> grains_error = Vec<dim>::Zero();
-  if (settings_.grains_move) {
-    const double stepping = seconds();
-    grains_.set_force(stress_force_);
-    grains_.set_drag(gamma, target);
-    for (auto& [boundary, follow] : follows_) follow->from = grains_.walls()[follow->wall].point;
-    report.grains = grains_.step(dt);
-    report.grains_time = seconds() - stepping;
-    sub_steps_ = report.grains.sub_steps;
-    drag_force_ = grains_.drag_impulse();
-    const auto in_contact = grains_.in_contact();
-    held_ = grains_.held();
-    const auto contact_impulse = grains_.contact_impulse();
-    const auto after = grains_.by_id([](const Grains<dim>& g, int k) { return Vec<dim>(g.body[k].v); });
-    for (int i = 0; i < n; ++i) {
-      free_[i] = !in_contact[i];
-      grains_error += m_[i] * (after[i] - v_[i]) - dt * (m_[i] * grains_.gravity + stress_force_[i]) - drag_force_[i] - contact_impulse[i];
+  for (int i = 0; i < n; ++i) handed += carry_[i];
+  std::vector<Vec<dim>> next_carry(n, Vec<dim>::Zero());
+  for (;;) {
+    if (settings.fluid_moves) {
+      set_reaction(dt);
+      const double stepping = seconds();
+      report.fluid = fluid_.step(dt);
+      report.fluid_time += seconds() - stepping;
+      flow_ = fluid_.projected();
+      tell_grains();
     }
-  } else {
-    for (int i = 0; i < n; ++i) drag_force_[i] = dt * gamma[i] * target[i];
+    move_grains(dt, report);
+    ++report.passes;
+    // What the fluid gave, as its own answer has it, less what the grains got.
+    Vec<dim> given = Vec<dim>::Zero(), carried = Vec<dim>::Zero();
+    double apart = 0.0;
+    report.exchanged_impulse = 0.0;
+    for (int i = 0; i < n; ++i) {
+      report.exchanged_impulse += drag_force_[i].norm();
+      if (!settings.fluid_moves) continue;
+      const Answer& answer = answer_[i];
+      const Vec<dim> gave = dt * (answer.beta * (target_[i] - answer.v) - answer.given + answer.yield * (grad_p_[i] - answer.grad_p));
+      next_carry[i] = gave - drag_force_[i];
+      given += gave, carried += next_carry[i], apart += next_carry[i].norm();
+    }
+    if (report.exchanged_impulse > 0) {
+      report.carried_impulse = carried.norm() / report.exchanged_impulse, report.disagreement = apart / report.exchanged_impulse;
+      if (settings.fluid_moves)
+        report.momentum_error = (dt * fluid_.momentum_residual() + (dt * fluid_.reaction_force() + given - handed) + grains_error_).norm() / report.exchanged_impulse;
+    }
+    if (!again || report.disagreement <= settings.tolerance || report.passes >= settings.max_passes) break;
+    answer_as_last(dt);
+    fluid_.back(), grains_.restore(grains_before);
   }
-  Vec<dim> carried = Vec<dim>::Zero();
-  double apart = 0.0;
+  carry_ = next_carry;
   for (int i = 0; i < n; ++i) {
-    report.exchanged_impulse += drag_force_[i].norm();
-    carry_[i] = settings_.fluid_moves ? Vec<dim>(carry_[i] - drag_force_[i]) : Vec<dim>::Zero();
-    carried += carry_[i], apart += carry_[i].norm();
     drag_force_[i] /= dt;
     report.drag += drag_force_[i];
-  }
-  if (report.exchanged_impulse > 0) {
-    report.carried_impulse = carried.norm() / report.exchanged_impulse, report.disagreement = apart / report.exchanged_impulse;
-    if (settings_.fluid_moves)
-      report.momentum_error = (dt * fluid_.momentum_residual() + (dt * fluid_.reaction_force() + given - handed) + grains_error).norm() / report.exchanged_impulse;
   }
   started_ = true;
   report.time = grains_.time();
   report.exchange_time = seconds() - begun - report.fluid_time - report.grains_time;
   return report;
+}
+
+// The grains' step in the flow as it is; drag_force_ is then drag's impulse.
+template <int dim>
+void Coupling<dim>::move_grains(double dt, Report<dim>& report) {
+  const int n = static_cast<int>(x_.size());
+  std::vector<double> gamma(n);
+  target_.resize(n), drag_force_.resize(n);
+  for (int i = 0; i < n; ++i) gamma[i] = drag_[i].gamma, target_[i] = u_[i] - drag_[i].shift;
+  grains_error_.setZero();
+  if (!settings.grains_move) {
+    for (int i = 0; i < n; ++i) drag_force_[i] = dt * gamma[i] * target_[i];
+    return;
+  }
+  const double stepping = seconds();
+  grains_.set_force(stress_force_);
+  grains_.set_drag(gamma, target_);
+  for (auto& [boundary, follow] : follows_) follow->from = grains_.walls()[follow->wall].point;
+  report.grains = grains_.step(dt);
+  report.grains_time += seconds() - stepping;
+  sub_steps_ = report.grains.sub_steps;
+  drag_force_ = grains_.drag_impulse();
+  held_ = grains_.held();
+  const auto& in_contact = grains_.in_contact();
+  const auto& contact_impulse = grains_.contact_impulse();
+  const auto after = grains_.by_id([](const Grains<dim>& g, int k) { return Vec<dim>(g.body[k].v); });
+  for (int i = 0; i < n; ++i) {
+    free_[i] = !in_contact[i];
+    grains_error_ += m_[i] * (after[i] - v_[i]) - dt * (m_[i] * grains_.gravity + stress_force_[i]) - drag_force_[i] - contact_impulse[i];
+  }
 }
 
 template <int dim>

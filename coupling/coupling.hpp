@@ -3,6 +3,7 @@
 //   2. the fluid makes its step. What it does to the grains is implicit in its velocity and pressure, and so is, as far as it can be known, what
 //      they do in answer: see below;
 //   3. the grains make theirs, in as many sub-steps as they need: drag implicit in the contact problem, pressure gradient and viscous stress given;
+//   A pass of 2 and 3 is made again where the two disagree by more than a tolerance, with the grains' last answer to begin with;
 //   4. what the grains got from drag and the fluid did not give, carry_i, is handed to the fluid in the next step: none is lost.
 // A grain's drag, linear about the slip s_0 that is expected, F = gamma (u - v - s), and the rest on it, R = m g - V grad p + V div(2 eta D(u)), move it
 // over dt in n sub-steps, were it free, such that drag's impulse is
@@ -23,6 +24,8 @@
 #include "fluid/fluid.hpp"
 #include "grains/simulation.hpp"
 
+#include <limits>
+
 namespace quicksand::coupling {
 
 // gamma [kg/s] of spheres; one call for many.
@@ -36,6 +39,8 @@ struct Settings {
   Discs discs = Discs::spheres;
   bool fluid_moves = true;     // false: it stays what it is, and feels no grain
   bool grains_move = true;     // false: a bed that is held
+  double tolerance = std::numeric_limits<double>::infinity();  // of the phases' disagreement; above it another pass is made
+  int max_passes = 20;
 };
 
 template <int dim>
@@ -43,6 +48,7 @@ struct Report {
   double time = 0.0, dt = 0.0;              // of the grains [s]
   StepReport<dim> grains;
   fluid::Report fluid;
+  int passes = 0;                           // of fluid and grains
   Vec<dim> drag = Vec<dim>::Zero();         // on all grains, mean over dt [N] (2D: N/m)
   double exchanged_impulse = 0.0;           // sum of |J_i| [N s]
   double carried_impulse = 0.0;             // |sum of carry_i| over it [-]
@@ -62,6 +68,8 @@ class Coupling {
   void follow(const std::string& boundary, int wall);
   // Grains whose centre leaves the mesh by this boundary are removed; by another, step() throws.
   void set_outlet(const std::string& boundary);
+
+  Settings settings;  // tolerance and max_passes may change
 
   Report<dim> step(double dt);
 
@@ -85,9 +93,9 @@ class Coupling {
     double gamma = 0.0;                    // [kg/s]
     Vec<dim> shift = Vec<dim>::Zero();     // [m/s]
   };
-  struct Answer {      // what the fluid takes J/dt to be: beta (u - shift - v) - given + yield (grad p - grad p before)
+  struct Answer {      // what the fluid takes J/dt to be: beta (u - shift - v) - given + yield (grad p - grad p known)
     double beta, yield;                    // [kg/s], [m^dim]
-    Vec<dim> given;                        // [N]
+    Vec<dim> v, given, grad_p;             // [m/s], [N], [Pa/m]
   };
 
   void take_grains();
@@ -95,13 +103,15 @@ class Coupling {
   double share_of(double k) const;
   void expect_drag(double dt);
   void linearise(const std::vector<int>& which, const std::vector<Vec<dim>>& slip, std::vector<double>& growth);
+  void answer_as_expected(double dt);
+  void answer_as_last(double dt);
   void set_reaction(double dt);
+  void move_grains(double dt, Report<dim>& report);
   void tell_grains();
   double solid_volume_of(int i) const { return solid_volume<dim>(r_[i]); }
 
   Simulation<dim>& grains_;
   fluid::Fluid<dim>& fluid_;
-  Settings settings_;
   std::shared_ptr<const Mesh<dim>> mesh_;
   Walker<dim> walker_;
   Kernel<dim> kernel_;
@@ -112,6 +122,8 @@ class Coupling {
 
   // Of grains, by id.
   std::vector<Vec<dim>> x_, v_, carry_, drag_force_, stress_force_;
+  std::vector<Vec<dim>> target_;   // u - shift, as the grains were told
+  Vec<dim> grains_error_;          // of their balance of momentum [N s]
   std::vector<Vec<dim>> u_, grad_p_;  // where the grain is, with its own weights
   std::vector<double> r_, m_, eps_at_;
   std::vector<Place<dim>> place_;

@@ -67,6 +67,7 @@ void bind(py::module_& m, const char* suffix) {
       .def_readonly("grains", &R::grains, "report of the grains' step")
       .def_readonly("fluid", &R::fluid, "report of the fluid's step")
       .def_property_readonly("drag", [](const R& r) { return r.drag; }, "on all grains, mean over the step (dim,) [N] (2D: N/m)")
+      .def_readonly("passes", &R::passes, "of fluid and grains")
       .def_readonly("exchanged_impulse", &R::exchanged_impulse, "sum over grains of |impulse of drag| [N s] (2D: N s/m)")
       .def_readonly("carried_impulse", &R::carried_impulse, "|impulse that the fluid gave less what the grains got|, handed to the fluid in the next step, over exchanged_impulse [-]")
       .def_readonly("disagreement", &R::disagreement, "the same summed grain by grain [-]")
@@ -100,6 +101,17 @@ void bind(py::module_& m, const char* suffix) {
       .def_readwrite("callback", &C::callback, "Called before each step, without arguments; None: nothing.")
       .def("state", [](const C& c) { return to_numpy(c.state()); }, "With the states of grains and fluid all that the next step depends on (n,).")
       .def("restore", [](C& c, const Array& state) { c.restore({state.data(), static_cast<std::size_t>(state.size())}); }, "state"_a)
+      .def_property("tolerance", [](const C& c) { return c.settings.tolerance; },
+                    [](C& c, double tolerance) {
+                      if (!(tolerance > 0)) throw std::invalid_argument(fmt::format("Coupling: tolerance must be > 0, got {}", tolerance));
+                      c.settings.tolerance = tolerance;
+                    },
+                    "of the phases' `disagreement` [-], above which another pass of fluid and grains is made, `max_passes` at most; infinite by default: one pass")
+      .def_property("max_passes", [](const C& c) { return c.settings.max_passes; },
+                    [](C& c, int passes) {
+                      if (passes < 1) throw std::invalid_argument(fmt::format("Coupling: max_passes must be >= 1, got {}", passes));
+                      c.settings.max_passes = passes;
+                    })
       .def_property_readonly("removed", &C::removed, "grains that left through outlets so far")
       .def_property_readonly("drag_force", [](const C& c) { return to_numpy(c.drag_force()); }, "on each grain, mean over the last step (n, dim) [N] (2D: N/m)")
       .def_property_readonly("stress_force", [](const C& c) { return to_numpy(c.stress_force()); }, "volume times (-grad p + div(2 eta D(u))) of each grain (n, dim) [N] (2D: N/m)")

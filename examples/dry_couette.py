@@ -102,7 +102,8 @@ def scene(**flags):
 class Scene:
     """The cell, its grains and its two walls."""
 
-    def __init__(self, flags):
+    def __init__(self, flags, start_phi=None):
+        """start_phi: the lattice is stretched across to this solid fraction [-]."""
         self.rng = rng = np.random.default_rng(flags.seed)
         count = len(grains.hexagonal_lattice(flags.width, flags.height, 2.1 * RADIUS, RADIUS))
         radius = grains.uniform_radii(count, RADIUS, flags.size_ratio, rng)
@@ -118,6 +119,11 @@ class Scene:
         while len(site := grains.hexagonal_lattice(flags.width, height, 2.1 * largest, largest)) < count:
             height += np.sqrt(0.75) * 2.1 * largest
         position = site[np.sort(rng.choice(len(site), count, replace=False))]
+
+        if start_phi is not None:
+            stretch = self.solid / (flags.width * start_phi) / height
+            height *= stretch
+            position[:, 1] *= stretch
 
         speed = flags.rate * flags.height / 2
         velocity = 0.01 * speed * rng.uniform(-1, 1, position.shape)

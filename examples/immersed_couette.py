@@ -12,6 +12,9 @@ Flags: those of examples/dry_couette.py (--help of it), out/immersed_couette, an
     --kernel-radius R0    standard deviation of the kernel that averages grains [m] (three mean radii: 1.5 diameters)
     --mesh-size H         element length [m] (0.008: four diameters)
     --element NAME        p1p1 or p2p1 (p1p1)
+    --start-phi PHI       solid fraction at the start [-] (0.83/(1 + 0.29 K), at most that of the dry lattice; K is the visco-inertial number at the
+                          nominal rate: near what such cells come to. Pores fill and drain through the plates as (height)^2 viscosity/pressure: a
+                          dense lattice would need ten times as long as the dry cell to find its height)
 
 results.json, SI, null where undefined: all keys of the dry example, and, means over t >= t_converged where nothing else is said,
     viscous_number          viscosity x shear_rate_bulk/P [-]
@@ -48,14 +51,21 @@ def parse_flags():
     parser.flag("--kernel-radius", type=study.number("m", above=0), default=3 * RADIUS)
     parser.flag("--mesh-size", type=study.number("m", above=0), default=8 * RADIUS)
     parser.flag("--element", choices=("p1p1", "p2p1"), default="p1p1")
+    parser.flag("--start-phi", type=study.number("", above=0))
     return parser, parser.parse_args()
+
+
+def start_phi(flags):
+    inertial = flags.rate * 2 * RADIUS * np.sqrt(DENSITY / flags.pressure)
+    stokes = DENSITY * (2 * RADIUS) ** 2 * flags.rate / flags.viscosity
+    return min(0.83 / (1 + 0.29 * inertial * np.sqrt(1 + 2 / stokes)), 0.8)
 
 
 class Immersed(Scene):
     """The dry cell in a fluid."""
 
     def __init__(self, flags):
-        super().__init__(flags)
+        super().__init__(flags, None if flags.fixed_height else flags.start_phi or start_phi(flags))
         low, high = (wall.position[1] for wall in self.walls)
         counts = [max(2, round(length / flags.mesh_size)) for length in (flags.width, high - low)]
         mesh = meshes.box([flags.width, high - low], counts, periodic=[True, False], origin=[-flags.width / 2, low])
@@ -199,7 +209,8 @@ def plot(results, scene, run, profile, stresses, flags):
     parts = stresses.mean(results["t_converged"])
     if parts is not None:
         names = ("contacts", "motion of grains", "fluid", "all")
-        lines = [(name, stresses.planes * results["h"], -values) for name, values in zip(names, [*parts, parts.sum(axis=0)])]
+        colours = (study.BLUE, study.FAINT, "tab:green", study.RED)
+        lines = [(name, colour, stresses.planes * results["h"], -values) for name, colour, values in zip(names, colours, [*parts, parts.sum(axis=0)])]
         study.plot_lines(flags.out / "shear_stress.png", "y [m]", r"$-\tau$ [Pa]", [("", lines)], scales=("linear", "linear"))
     study.plot_snapshot(flags.out / "snapshot.png", scene.sim, *scene.faces, scene.fixed_grains(), title=f"$t$ = {scene.sim.time:.3g} s")
 

@@ -338,9 +338,35 @@ static double fingerprint(const Space<dim>& space) {
 }
 
 template <int dim>
-std::vector<double> Fluid<dim>::state() {
-  std::vector<double> all{fingerprint(space_)};
+std::vector<double> Fluid<dim>::parts() {
+  std::vector<double> all;
   each_part([&](std::span<double> part) { all.insert(all.end(), part.begin(), part.end()); });
+  return all;
+}
+
+template <int dim>
+void Fluid<dim>::set_parts(std::span<const double> parts) {
+  std::size_t at = 0;
+  each_part([&](std::span<double> part) {
+    std::copy_n(parts.begin() + at, part.size(), part.begin());
+    at += part.size();
+  });
+}
+
+template <int dim>
+void Fluid<dim>::mark() {
+  marked_ = parts(), marked_move_ = moved_for_;
+}
+
+template <int dim>
+void Fluid<dim>::back() {
+  set_parts(marked_), moved_for_ = marked_move_;
+}
+
+template <int dim>
+std::vector<double> Fluid<dim>::state() {
+  std::vector<double> all = parts();
+  all.insert(all.begin(), fingerprint(space_));
   if (solver_) solver_->forget();
   return all;
 }
@@ -351,11 +377,7 @@ void Fluid<dim>::restore(std::span<const double> state) {
   each_part([&](std::span<double> part) { size += part.size(); });
   if (state.empty() || state[0] != fingerprint(space_) || state.size() != size)
     fail("restore: the state is of another mesh or element ({} numbers where this one has {}); make the fluid on the mesh it was saved with", state.size(), size);
-  std::size_t at = 1;
-  each_part([&](std::span<double> part) {
-    std::copy_n(state.begin() + at, part.size(), part.begin());
-    at += part.size();
-  });
+  set_parts(state.subspan(1));
   old_position_ = position_, moved_for_ = 0.0;
   if (solver_) solver_->forget();
 }

@@ -97,6 +97,10 @@ class Fluid {
   Report step(double dt);
   Report solve_steady();
 
+  // mark() before a step and back() after it: the step can be made again, with another reaction.
+  void mark();
+  void back();
+
   // All that changes from step to step; conditions, fields and settings do not belong to it. The step after state() factorises anew, so that
   // a run that goes on and one that is restored there, on as many ranks, stay the same bit for bit; on several ranks not with MUMPS, which adds
   // up messages as they come. restore() throws std::invalid_argument where the state is of another mesh or element.
@@ -164,6 +168,8 @@ class Fluid {
   bool has_pressure_reference() const;
   template <class Visit>
   void each_part(Visit&& visit);
+  std::vector<double> parts();
+  void set_parts(std::span<const double> parts);
   void move_mesh(double t, double dt);
   void undo_move();
   std::vector<Vec<dim>> harmonic(const std::vector<std::vector<int>>& moved, const std::vector<std::vector<Vec<dim>>>& velocity);
@@ -214,6 +220,8 @@ class Fluid {
   std::optional<double> mean_pressure_;
   std::vector<Vec<dim>> position_, old_position_;  // of mesh nodes, now and at the start of the step
   std::vector<Vec<dim>> mesh_velocity_, old_mesh_velocity_;  // of mesh nodes
+  std::vector<double> marked_;
+  double marked_move_ = 0.0;
   double moved_for_ = 0.0;                         // length of the coming step where move() was called, else 0 [s]
   std::array<std::vector<double>, 3> eps_;         // at velocity nodes: now, one and two steps ago
   std::array<std::vector<double>, 2> x_;           // unknowns, Cartesian, after the last step and the one before
