@@ -138,6 +138,7 @@ void Fluid<dim>::add_boundaries() {
         const auto grad = shape_gradients<dim, order>(l, facet.geometry.grad_l);
         const Vec<dim> area = weight * facet.area;
         double eps = 0.0;
+        const double yield = yield_at(mesh_->elements[facet.element], l);
         Vec<dim> flux = Vec<dim>::Zero(), grad_eps = Vec<dim>::Zero(), mesh_velocity = Vec<dim>::Zero();
         for (int a = 0; a < n; ++a) eps += shape[a] * in.eps[0][a], flux += shape[a] * in.flux[0][a], grad_eps += in.eps[0][a] * grad[a];
         for (int a = 0; a <= dim; ++a) mesh_velocity += l[a] * in.mesh_velocity[a];
@@ -145,8 +146,8 @@ void Fluid<dim>::add_boundaries() {
         for (int a = 0; a < n; ++a)
           for (int i = 0; i < dim; ++i) {
             const int row = dof_of<dim>(a) + i;
-            system.b[row] += shape[a] * (enters * outer_velocity_[k][q][i] - eps * outer_pressure_[k][q] * area[i]);
-            for (int b = 0; b <= dim; ++b) system.a(row, dof_of<dim>(b) + dim) -= shape[a] * eps * l[b] * area[i];
+            system.b[row] += shape[a] * (enters * outer_velocity_[k][q][i] - (eps + yield) * outer_pressure_[k][q] * area[i]);
+            for (int b = 0; b <= dim; ++b) system.a(row, dof_of<dim>(b) + dim) -= shape[a] * (eps + yield) * l[b] * area[i];
             for (int b = 0; b < n; ++b) {
               system.a(row, dof_of<dim>(b) + i) += enters * shape[a] * shape[b] / eps;
               if (conditions_[k].kind != Kind::outflow) continue;

@@ -153,10 +153,12 @@ void Fluid<dim>::set_reaction(std::vector<Reaction<dim>> reaction) {
   for (std::size_t k = 0; k < reaction.size(); ++k)
     if (!(reaction[k].beta >= 0 && std::isfinite(reaction[k].beta)) || !reaction[k].beta_target.allFinite() || !reaction[k].force.allFinite() || !(reaction[k].yield >= 0))
       fail("set_reaction: beta must be >= 0 kg/(m^3 s), target and force finite, yield >= 0, got beta = {}, yield = {} at point {}", reaction[k].beta, reaction[k].yield, k);
+  yield_.clear();
   if (reaction.size() != mesh_->nodes.size()) {
     reaction_ = std::move(reaction);
     return;
   }
+  for (const Reaction<dim>& at_node : reaction) yield_.push_back(at_node.yield);
   reaction_.clear();
   with_order(velocity_order(), [&]<int order>(std::integral_constant<int, order>) {
     for (const auto& element : mesh_->elements)
@@ -379,6 +381,7 @@ void Fluid<dim>::restore(std::span<const double> state) {
     fail("restore: the state is of another mesh or element ({} numbers where this one has {}); make the fluid on the mesh it was saved with", state.size(), size);
   set_parts(state.subspan(1));
   old_position_ = position_, moved_for_ = 0.0;
+  evaluate_outside(time_);  // for projected()
   if (solver_) solver_->forget();
 }
 

@@ -133,7 +133,7 @@ class Fluid {
   // Projected on the nodes of the mesh with lumped masses, int N f/int N of each: what grains are told, adjoint to fields that are linear between nodes.
   struct Projected {
     std::vector<Vec<dim>> velocity;           // u [m/s]
-    std::vector<Vec<dim>> pressure_gradient;  // [Pa/m]
+    std::vector<Vec<dim>> pressure_gradient;  // [Pa/m], with the step to the pressure outside where that is given
     std::vector<Vec<dim>> viscous_force;      // div(2 eta D(u)), the traction at the boundary included [N/m^3]
   };
   Projected projected() const;
@@ -187,6 +187,9 @@ class Fluid {
   std::vector<Vec<dim>> advances(const std::vector<double>& x, double dt) const;
   template <class Use>
   void each_point(Use&& use) const;
+  template <class Use>
+  void each_open_point(Use&& use) const;
+  double yield_at(const std::array<int, dim + 1>& corners, const Barycentric<dim>& l) const;
   template <int order>
   void scatter(int local, const ElementSystem<dim, order>& system);
   template <int order>
@@ -234,6 +237,7 @@ class Fluid {
   TimeWeights time_weights_{};                     // of the last step
   std::array<std::vector<double>, 2> eps_change_;  // over this step and the last: int q (change of eps at a fixed point), per vertex [m^dim]
   std::vector<Reaction<dim>> reaction_;
+  std::vector<double> yield_;                      // of the reaction at mesh nodes; empty: 0
   std::vector<Held> held_;
   std::vector<char> has_frame_;
   std::vector<std::vector<double>> outer_pressure_;  // per boundary, at the facets' quadrature points

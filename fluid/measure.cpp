@@ -180,6 +180,31 @@ auto Fluid<dim>::probe(std::span<const Vec<dim>> x) const -> std::vector<Probe> 
   return found;
 }
 
+// Calls use(facet, point in its element, area times normal, p_out - p) where the pressure outside is given.
+template <int dim>
+template <class Use>
+void Fluid<dim>::each_open_point(Use&& use) const {
+  for (std::size_t k = 0; k < conditions_.size(); ++k) {
+    if (!conditions_[k].pressure || outer_pressure_[k].empty()) continue;  // before the first step nothing is known
+    std::size_t q = 0;
+    for (const int f : facets_of_[k]) {
+      const FacetView<dim> facet(*mesh_, position_, f);
+      along<dim>(facet, [&](const Barycentric<dim>& l, double weight) {
+        double p = 0.0;
+        for (int a = 0; a <= dim; ++a) p += l[a] * x_[0][space_.pressure_dof(space_.vertex[mesh_->elements[facet.element][a]])];
+        use(facet, l, Vec<dim>(weight * facet.area), outer_pressure_[k][q++] - p);
+      });
+    }
+  }
+}
+
+template <int dim>
+double Fluid<dim>::yield_at(const std::array<int, dim + 1>& corners, const Barycentric<dim>& l) const {
+  double yield = 0.0;
+  for (int a = 0; a <= dim && !yield_.empty(); ++a) yield += l[a] * yield_[corners[a]];
+  return yield;
+}
+
 template <int dim>
 auto Fluid<dim>::projected() const -> Projected {
   const std::vector<Vec<dim>> none(space_.nodes(), Vec<dim>::Zero());
@@ -232,6 +257,9 @@ auto Fluid<dim>::projected() const -> Projected {
       });
     }
   });
+  each_open_point([&](const FacetView<dim>& facet, const Barycentric<dim>& l, const Vec<dim>& area, double step) {
+    for (int a = 0; a <= dim; ++a) sum.pressure_gradient[space_.vertex[mesh_->elements[facet.element][a]]] += l[a] * step * area;
+  });
   const std::vector<double> volumes = vertex_volumes();
   Projected at_nodes;
   for (const int node : space_.vertex) {
@@ -270,6 +298,9 @@ Vec<dim> Fluid<dim>::reaction_force() const {
         sum += rule[q].weight * g.volume * (r.beta_target + r.force - r.beta * velocity_in(static_cast<int>(e), rule[q].l) - r.yield * grad_p);
       }
     }
+  });
+  each_open_point([&](const FacetView<dim>& facet, const Barycentric<dim>& l, const Vec<dim>& area, double step) {
+    sum -= yield_at(mesh_->elements[facet.element], l) * step * area;
   });
   return sum;
 }
