@@ -8,10 +8,10 @@ namespace quicksand::coupling {
 
 namespace {
 
-// Samples of an element: the middles of the parts that it is cut into, its corners and what is between them, again and again; in 3D that is an
-// octahedron, cut into four. All are of the same volume.
+// Samples of an element: those of a rule of degree 4 on each of the parts that it is cut into, its corners and what is between them, again and again;
+// in 3D that is an octahedron, cut into four. All parts are of the same volume.
 template <int dim>
-std::vector<Barycentric<dim>> middles(int halvings) {
+std::vector<fluid::QuadraturePoint<dim>> samples_of_parts(int halvings) {
   using Corners = std::array<Barycentric<dim>, dim + 1>;
   Corners whole{};
   for (int a = 0; a <= dim; ++a) whole[a][a] = 1.0;
@@ -39,17 +39,17 @@ std::vector<Barycentric<dim>> middles(int halvings) {
     }
     parts.swap(next);
   }
-  std::vector<Barycentric<dim>> middles;
-  for (const Corners& c : parts) {
-    Barycentric<dim> m{};
-    for (const auto& corner : c)
-      for (int k = 0; k <= dim; ++k) m[k] += corner[k] / (dim + 1);
-    middles.push_back(m);
-  }
-  return middles;
+  std::vector<fluid::QuadraturePoint<dim>> samples;
+  for (const Corners& c : parts)
+    for (const auto& point : fluid::quadrature<dim, 2>()) {
+      auto& sample = samples.emplace_back(fluid::QuadraturePoint<dim>{{}, point.weight / parts.size()});
+      for (int a = 0; a <= dim; ++a)
+        for (int k = 0; k <= dim; ++k) sample.l[k] += point.l[a] * c[a][k];
+    }
+  return samples;
 }
 
-constexpr double apart_at_most = 0.4;  // of samples, in spacings of the splines
+constexpr double apart_at_most = 0.8;  // of samples, in spacings of the splines
 
 }  // namespace
 
@@ -67,11 +67,12 @@ Kernel<dim>::Kernel(std::shared_ptr<const Mesh<dim>> mesh, Shape shape, double r
     double largest = 0.0;
     for (const auto& element : mesh_->elements) largest = std::max(largest, fluid::geometry<dim>(mesh_->nodes, element).volume);
     const int elements_at_node = dim == 2 ? 6 : 24;
-    if (std::pow(largest * elements_at_node / (dim + 1), 1.0 / dim) > apart_at_most * wanted) {
+    if (std::pow(largest * elements_at_node / (dim + 1), 1.0 / dim) > 0.4 * wanted) {
       int halvings = 0;
-      for (double apart = std::pow(largest, 1.0 / dim); apart > apart_at_most * wanted && halvings < 8; apart *= 0.5) ++halvings;
+      const std::size_t in_part = fluid::quadrature<dim, 2>().size();
+      for (double apart = std::pow(largest / in_part, 1.0 / dim); apart > apart_at_most * wanted && halvings < 8; apart *= 0.5) ++halvings;
       if (halvings > 5) meshes::fail("Coupling: kernel_radius = {} m is too small for elements of {} m^{}: take kernel=\"hat\", a finer mesh or a larger radius", radius, largest, dim);
-      in_element_ = middles<dim>(halvings);
+      in_element_ = samples_of_parts<dim>(halvings);
     }
   }
   place(mesh_->nodes);
@@ -109,13 +110,13 @@ void Kernel<dim>::place(const std::vector<Vec<dim>>& nodes) {
     }
   } else {
     for (const auto& element : mesh_->elements) {
-      const double volume = fluid::geometry<dim>(nodes, element).volume / in_element_.size();
+      const double volume = fluid::geometry<dim>(nodes, element).volume;
       std::array<int, dim + 1> node;
       for (int a = 0; a <= dim; ++a) node[a] = mesh_->master[element[a]];
-      for (const auto& l : in_element_) {
+      for (const auto& [l, share] : in_element_) {
         Vec<dim> x = Vec<dim>::Zero();
         for (int a = 0; a <= dim; ++a) x += l[a] * nodes[element[a]];
-        add(x, volume, node, l);
+        add(x, share * volume, node, l);
       }
     }
   }

@@ -62,7 +62,7 @@ class Kernel {
   Vec<dim> spacing_, origin_;
   std::array<int, dim> periodic_;        // splines along a period, or 0
   std::array<int, dim> first_, count_;   // of the grid that the mesh takes
-  std::vector<Barycentric<dim>> in_element_;  // of the samples; empty: nodes
+  std::vector<fluid::QuadraturePoint<dim>> in_element_;  // the samples; empty: nodes
   std::vector<Sample> samples_;
   std::vector<double> masses_, spline_weight_;
   int per_grain_;
