@@ -37,6 +37,7 @@ Coupling<dim>::Coupling(Simulation<dim>& grains, fluid::Fluid<dim>& fluid, Setti
   }
   if (settings.fluid_moves) {
     fluid_.settings.scheme = fluid::Scheme::backward_euler;
+    fluid_.reaction_on_change = true;
     // Drag makes the equations easy, elements of several grains make few of them: of 1200 in 2D, ILU takes a third of the time of MUMPS, whose factors
     // have to be new in most steps. What it leaves open is momentum lost.
     if (!fluid_.settings.linear) {
@@ -100,17 +101,19 @@ void Coupling<dim>::locate() {
 // What the flow is and does where each grain is.
 template <int dim>
 void Coupling<dim>::tell_grains() {
-  using Values = Eigen::Matrix<double, 3 * dim + 1, 1>;
+  using Values = Eigen::Matrix<double, 3 * dim, 1>;
   std::vector<Values> at_nodes(mesh_->nodes.size());
-  for (std::size_t k = 0; k < at_nodes.size(); ++k) at_nodes[k] << flow_.velocity[k], flow_.pressure_gradient[k], flow_.viscous_force[k], eps_[k];
+  for (std::size_t k = 0; k < at_nodes.size(); ++k) at_nodes[k] << flow_.velocity[k], flow_.pressure_gradient[k], flow_.viscous_force[k];
   const std::vector<Values> at_carriers = kernel_.to_carriers(at_nodes, Values(Values::Zero()));
   const std::size_t n = x_.size();
-  u_.resize(n), grad_p_.resize(n), stress_force_.resize(n), eps_at_.resize(n);
+  u_.resize(n), u_mean_.resize(n), grad_p_.resize(n), stress_force_.resize(n), eps_at_.resize(n);
   for (std::size_t i = 0; i < n; ++i) {
     const Values here = kernel_.at_grain(static_cast<int>(i), at_carriers);
-    u_[i] = here.template head<dim>(), grad_p_[i] = here.template segment<dim>(dim);
+    u_mean_[i] = here.template head<dim>(), grad_p_[i] = here.template segment<dim>(dim);
     stress_force_[i] = solid_volume_of(static_cast<int>(i)) * (here.template segment<dim>(2 * dim) - grad_p_[i]);
-    eps_at_[i] = here[3 * dim];
+    u_[i] = fluid_.velocity_in(place_[i].element, place_[i].l);
+    eps_at_[i] = 0.0;
+    for (int a = 0; a <= dim; ++a) eps_at_[i] += place_[i].l[a] * eps_[mesh_->elements[place_[i].element][a]];
   }
 }
 
@@ -174,7 +177,7 @@ template <int dim>
 void Coupling<dim>::answer_as_expected(double dt) {
   for (std::size_t i = 0; i < x_.size(); ++i) {
     const double gamma = drag_[i].gamma, c = settings.grains_move ? share_of(dt * gamma / m_[i]) : 0.0;
-    answer_[i] = {gamma, started_ ? c * solid_volume_of(static_cast<int>(i)) : 0.0, v_[i], Vec<dim>::Zero(), grad_p_[i]};
+    answer_[i] = {gamma, started_ ? c * solid_volume_of(static_cast<int>(i)) : 0.0, settings.grains_move ? v_[i] : Vec<dim>(Vec<dim>::Zero()), Vec<dim>::Zero(), grad_p_[i]};
     if (!free_[i] || !settings.grains_move) continue;
     answer_[i].beta = (1 - c) * gamma;
     answer_[i].given = c * (m_[i] * grains_.gravity + stress_force_[i]);
@@ -199,7 +202,7 @@ void Coupling<dim>::set_reaction(double dt) {
   for (std::size_t i = 0; i < x_.size(); ++i) {
     const Answer& answer = answer_[i];
     Values values;
-    values << answer.beta, answer.yield, answer.beta * (answer.v + drag_[i].shift), answer.given + answer.yield * answer.grad_p + carry_[i] / dt, Vec<dim>::Zero();
+    values << answer.beta, answer.yield, answer.beta * (answer.v + drag_[i].shift - u_before_[i]), answer.given + answer.yield * answer.grad_p + carry_[i] / dt, Vec<dim>::Zero();
     for (int axis = 0; axis < dim; ++axis)
       if (!(held_[i] >> axis & 1)) values[2 + 2 * dim + axis] = solid_volume_of(static_cast<int>(i));
     kernel_.give(static_cast<int>(i), values, to_carriers);
@@ -235,6 +238,7 @@ Report<dim> Coupling<dim>::step(double dt) {
     nodes.resize(mesh_->nodes.size());
     walker_.place(nodes);
     kernel_.place(nodes);
+    flow_ = fluid_.projected();
   }
   take_grains();
   const int before = removed_;
@@ -256,6 +260,7 @@ Report<dim> Coupling<dim>::step(double dt) {
   tell_grains();
   expect_drag(dt);
   answer_as_expected(dt);
+  u_before_ = u_, u_mean_before_ = u_mean_;
   const bool again = settings.fluid_moves && settings.grains_move && std::isfinite(settings.tolerance);
   if (again) fluid_.mark();
   const std::vector<char> grains_before = again ? grains_.state() : std::vector<char>{};
@@ -281,7 +286,8 @@ Report<dim> Coupling<dim>::step(double dt) {
       report.exchanged_impulse += drag_force_[i].norm();
       if (!settings.fluid_moves) continue;
       const Answer& answer = answer_[i];
-      const Vec<dim> gave = dt * (answer.beta * (target_[i] - answer.v) - answer.given + answer.yield * (grad_p_[i] - answer.grad_p));
+      const Vec<dim> u = u_before_[i] + u_mean_[i] - u_mean_before_[i];  // as its equations have it
+      const Vec<dim> gave = dt * (answer.beta * (u - drag_[i].shift - answer.v) - answer.given + answer.yield * (grad_p_[i] - answer.grad_p));
       next_carry[i] = gave - drag_force_[i];
       given += gave, carried += next_carry[i], apart += next_carry[i].norm();
     }

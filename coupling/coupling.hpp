@@ -16,6 +16,12 @@
 // the target v_0, for a free grain's answer given to a held one is explicit drag, unstable for k > 2; the answer to the pressure, c V; and that
 // continuity knows what follows the fluid: all grains but those that lean on a wall, by whatever chain of contacts. Theirs would be a false alarm
 // that swings on, in a bed with clear fluid above.
+// Drag sees the flow where the grain is, u_i = u(x_i), and gives it to the fluid by the kernel: -sum_i K_i gamma_i (u_i - v_i). Implicit, that would couple
+// all nodes within a kernel. Its usual short form, beta (u - v), beta = sum gamma_i K_i, couples neighbours only, but drags all of the fluid within a
+// kernel along with a grain that differs from it by shear: a viscosity of beta r_0^2, in dense beds hundreds of times the fluid's. (The mean over the
+// kernel in the place of u_i has no such viscosity, but the flow must then be what, averaged, is as the grains are: along walls it overshoots.) So
+// beta takes the change of u over the step only (Fluid::reaction_on_change), the rest is as it was: the Fourier transform of K is between 0 and 1,
+// this is a contraction, however large beta dt is.
 #pragma once
 
 #include "drag.hpp"
@@ -124,7 +130,8 @@ class Coupling {
   std::vector<Vec<dim>> x_, v_, carry_, drag_force_, stress_force_;
   std::vector<Vec<dim>> target_;   // u - shift, as the grains were told
   Vec<dim> grains_error_;          // of their balance of momentum [N s]
-  std::vector<Vec<dim>> u_, grad_p_;  // where the grain is, with its own weights
+  std::vector<Vec<dim>> u_, u_mean_, grad_p_;      // where the grain is; mean over its kernel
+  std::vector<Vec<dim>> u_before_, u_mean_before_;  // the fluid's step
   std::vector<double> r_, m_, eps_at_;
   std::vector<Place<dim>> place_;
   std::vector<char> free_;         // bore no contact in the last step

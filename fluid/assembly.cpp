@@ -38,6 +38,7 @@ ElementInput<dim, order> Fluid<dim>::input(int element) const {
   if constexpr (order == 1)
     for (int t = 0; t < 2; ++t) in.subscale[t] = &subscale_[t][element * quadrature<dim, 1>().size()];
   if (!advance_.empty()) in.advance = &advance_[element * quadrature<dim, order>().size()];
+  in.reaction_on_change = reaction_on_change;
   in.advection = settings.advection != Advection::none;
   return in;
 }

@@ -51,6 +51,7 @@ struct ElementInput {
   std::array<Vec<dim>, dim + 1> mesh_velocity;     // [m/s]
   const Reaction<dim>* reaction = nullptr;         // at each quadrature point, or none
   std::array<const Vec<dim>*, 2> subscale{};       // order 1: one and two steps ago, at each quadrature point [m/s]; none: 0
+  bool reaction_on_change = false;                 // see Fluid
   const Vec<dim>* advance = nullptr;               // of the solid's flux before, at each quadrature point [m/s]: see Fluid::grains_follow
   bool advection = true;
   bool newton = false;                             // derivative of the advection as well; otherwise by the guess alone
@@ -137,10 +138,11 @@ struct AtPoint {
     grad_eps.setZero();
     for (int a = 0; a < n; ++a) grad_eps += in.eps[0][a] * grad[a];
     for (int a = 0; a <= dim; ++a) mesh_velocity += point.l[a] * in.mesh_velocity[a];
-    const Reaction<dim> reaction = in.reaction ? in.reaction[q] : Reaction<dim>{};
+    Reaction<dim> reaction = in.reaction ? in.reaction[q] : Reaction<dim>{};
     eps = eps_at[0];
     drives = eps + reaction.yield, follows = reaction.follows;
     past_velocity = flux[1] / eps_at[1];
+    if (in.reaction_on_change) reaction.beta_target += reaction.beta * past_velocity;
     eps_rate = rate(time, eps_at[0] - eps_at[1], eps_at[1] - eps_at[2]) - mesh_velocity.dot(grad_eps);
     const double inv_eps = 1.0 / eps;
     relative = in.advection ? Vec<dim>(flux[0] * inv_eps - mesh_velocity) : Vec<dim>::Zero();

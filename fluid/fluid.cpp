@@ -62,7 +62,11 @@ void Fluid<dim>::set_void_fraction(std::span<const double> eps) {
     const auto [a, b] = space_.between[node];
     eps_[0][node] = eps.size() == all ? eps[k++] : 0.5 * (eps_[0][space_.vertex[a]] + eps_[0][space_.vertex[b]]);
   }
-  if (!eps_started_) eps_[2] = eps_[1] = eps_[0], pore_volume_.fill(pore_volume(eps_[0]));  // the first to be set is that of the start as well
+  if (!eps_started_) {  // the first to be set is that of the start as well, whose velocity stays
+    for (int node = 0; node < space_.nodes(); ++node)
+      for (auto& x : x_) Eigen::Map<Vec<dim>>(&x[space_.first_dof[node]]) *= eps_[0][node] / eps_[1][node];
+    eps_[2] = eps_[1] = eps_[0], pore_volume_.fill(pore_volume(eps_[0]));
+  }
   eps_started_ = true;
 }
 

@@ -85,6 +85,8 @@ class Fluid {
   void set_reaction(std::vector<Reaction<dim>> reaction);
   std::vector<Vec<dim>> quadrature_points() const;
   std::vector<double> quadrature_weights() const;  // they add up to the volume [m^dim]
+  // The reaction is beta (target - (u - u before)) + force: what beta stands for is then no more than the change of a force that is told otherwise.
+  bool reaction_on_change = false;
   // The grains' void fraction is that of the start of a step: d(eps)/dt lags behind by one, and where grains follow the fluid, u ~ v, a column
   // of more than half solids would answer every step with a larger one, u = -(1 - eps)/eps v. With this set, continuity takes the change of the
   // solid's flux that goes with the fluid's own in advance, and gives back what it took a step before:
@@ -124,6 +126,8 @@ class Fluid {
   Moment torque(const std::string& boundary, const Vec<dim>& centre) const;
   // int (U - eps w) . n over the last step along a named boundary, or named facets inside [m^dim/s]: relative to the mesh.
   double flux(const std::string& boundary) const;
+  // u in an element, after the last step or the one before [m/s].
+  Vec<dim> velocity_in(int element, const Barycentric<dim>& l, int steps_ago = 0) const;
   struct Probe {
     Vec<dim> velocity;
     double pressure;
@@ -204,7 +208,6 @@ class Fluid {
   std::vector<int> node_numbers() const;
   Vec<dim> mesh_velocity_at(int node) const;
   std::vector<std::pair<int, Vec<dim>>> facet_nodes(int facet) const;
-  Vec<dim> velocity_in(int element, const Barycentric<dim>& l) const;
   void spread_surplus(const char* function, const std::vector<double>& x, const TimeWeights& time, std::vector<double>& missing) const;
   std::vector<double> vertex_volumes() const;
   double mean_pressure(const std::vector<double>& x) const;

@@ -145,15 +145,15 @@ auto Fluid<dim>::error(const VectorField<dim>& velocity, const ScalarField<dim>&
 }
 
 template <int dim>
-Vec<dim> Fluid<dim>::velocity_in(int element, const Barycentric<dim>& l) const {
+Vec<dim> Fluid<dim>::velocity_in(int element, const Barycentric<dim>& l, int steps_ago) const {
   double eps = 0.0;
   Vec<dim> flux = Vec<dim>::Zero();
   with_order(velocity_order(), [&]<int order>(std::integral_constant<int, order>) {
     const auto shape = shapes<dim, order>(l);
     for (int a = 0; a < shape_count<dim, order>; ++a) {
       const int node = space_.node_of[element * space_.per_element + a];
-      eps += shape[a] * eps_[1][node];
-      flux += shape[a] * Eigen::Map<const Vec<dim>>(&x_[0][space_.first_dof[node]]);
+      eps += shape[a] * eps_[1 + steps_ago][node];
+      flux += shape[a] * Eigen::Map<const Vec<dim>>(&x_[steps_ago][space_.first_dof[node]]);
     }
   });
   return flux / eps;
@@ -295,7 +295,9 @@ Vec<dim> Fluid<dim>::reaction_force() const {
       for (int a = 0; a <= dim; ++a) grad_p += x_[0][space_.pressure_dof(space_.vertex[corners[a]])] * g.grad_l[a];
       for (std::size_t q = 0; q < rule.size(); ++q) {
         const Reaction<dim>& r = reaction_[e * rule.size() + q];
-        sum += rule[q].weight * g.volume * (r.beta_target + r.force - r.beta * velocity_in(static_cast<int>(e), rule[q].l) - r.yield * grad_p);
+        Vec<dim> u = velocity_in(static_cast<int>(e), rule[q].l);
+        if (reaction_on_change) u -= velocity_in(static_cast<int>(e), rule[q].l, 1);
+        sum += rule[q].weight * g.volume * (r.beta_target + r.force - r.beta * u - r.yield * grad_p);
       }
     }
   });

@@ -271,6 +271,7 @@ void add_fluid(py::module_& m, const char* name) {
       .def_property_readonly("dim", [](const F&) { return dim; })
       .def_property_readonly("mesh", [](const F& f) { return std::const_pointer_cast<Mesh<dim>>(f.space().mesh); }, "as it was at the start: `nodes` tells where it is")
       .def_property_readonly("element", [](const F& f) { return word_for(f.velocity_order(), elements); })
+      .def("reaction_force", &F::reaction_force, "Of the reaction on the fluid in the last step (dim,) [N] (2D: N/m).")
       .def("force", &F::force, "boundary"_a, "Of the fluid on a boundary (dim,) [N] (2D: N/m).")
       .def("torque",
            [](const F& f, const std::string& boundary, const py::object& centre) -> py::object {
