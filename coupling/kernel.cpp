@@ -194,7 +194,7 @@ const Weights<dim>& Kernel<dim>::weigh(std::span<const Vec<dim>> x, const std::v
     auto push = [&](int node, double weight) { weights_.node.push_back(node), weights_.weight.push_back(weight); };
     const auto& corners = mesh_->elements[places[i].element];
     if (shape_ == Shape::hat) {
-      for (int a = 0; a <= dim; ++a) push(mesh_->master[corners[a]], places[i].l[a]);
+      for (int a = 0; a <= dim; ++a) push(mesh_->master[corners[a]], std::max(places[i].l[a], 0.0));  // on a face it may be below, by rounding
     } else {
       double total = 0.0;
       auto add = [&](int node, double weight) {

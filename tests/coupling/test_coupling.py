@@ -340,3 +340,25 @@ def test_what_cannot_be_is_named():
     flow.scheme = "bdf2"
     with pytest.raises(ValueError, match="backward_euler"):
         both.step(1e-3)
+
+
+def test_a_void_fraction_of_one_that_rounding_put_above_is_one():
+    """The weights of a disc here add up to 1 + 2e-16: the void fraction of spheres is of no negative number."""
+    sim = simulation(2, np.array([[0.0, 0.0]]), gravity=(0, -GRAVITY))
+    flow = fluid.Fluid(meshes.box([20 * D] * 2, size=5 * D, origin=[-10 * D] * 2), density=WATER, viscosity=VISCOSITY)
+    for boundary in flow.mesh.boundary_names:
+        flow.wall(boundary)
+    flow.mean_pressure(0.0)
+    both = coupling.Coupling(sim, flow, kernel="hat", fluid_moves=False)
+    for x in np.random.default_rng(0).uniform(-9, 9, (200, 2)) * D:
+        sim.position = x[None]
+        both.step(1e-3)
+
+
+def test_a_grain_on_the_face_of_an_element_weighs_nothing_negative():
+    """Of its coordinates there one may be below 0, by rounding."""
+    for seed in range(20):
+        x = lattice((4, 4, 4), [12 * D] * 3, [-6 * D] * 3) + np.random.default_rng(seed).integers(-3, 4, (64, 3)) * D / 4
+        flow = fluid.Fluid(meshes.box([12 * D] * 3, [4] * 3, periodic=[True] * 3, origin=[-6 * D] * 3), density=WATER, viscosity=VISCOSITY)
+        flow.mean_pressure(0.0)
+        coupling.Coupling(simulation(3, x, period=[12 * D] * 3), flow, kernel="hat").step(1e-3)
