@@ -55,7 +55,7 @@ inline double beetstra(const Suspension& s) {
 enum class Discs { spheres, cylinders };
 inline double void_fraction_of_spheres(double eps_of_discs) {
   const double least = 2 / std::sqrt(std::numbers::pi * std::sqrt(3.0));
-  return 1 - least * std::pow(1 - eps_of_discs, 1.5);
+  return 1 - least * std::pow(std::max(1 - eps_of_discs, 0.0), 1.5);  // 1 as a sum of weights may be above it, by rounding
 }
 inline double per_depth(Discs discs, double diameter) { return discs == Discs::spheres ? 1.5 / diameter : 4 / (std::numbers::pi * diameter); }
 

@@ -166,7 +166,7 @@ void Kernel<dim>::weigh(std::span<const Vec<dim>> x, const std::vector<Place<dim
       continue;
     }
     const auto& corners = mesh_->elements[places[i].element];
-    for (int a = 0; a <= dim; ++a) carrier_[i * per_grain_ + a] = mesh_->master[corners[a]], weight_[i * per_grain_ + a] = places[i].l[a];
+    for (int a = 0; a <= dim; ++a) carrier_[i * per_grain_ + a] = mesh_->master[corners[a]], weight_[i * per_grain_ + a] = std::max(places[i].l[a], 0.0);  // below 0 by rounding, on a face
   }
 }
 

@@ -340,3 +340,74 @@ def test_what_cannot_be_is_named():
     flow.scheme = "bdf2"
     with pytest.raises(ValueError, match="backward_euler"):
         both.step(1e-3)
+
+
+def test_a_void_fraction_of_one_that_rounding_put_above_is_one():
+    """The weights of a disc here add up to 1 + 2e-16: the void fraction of spheres is of no negative number."""
+    sim = simulation(2, np.array([[0.0, 0.0]]), gravity=(0, -GRAVITY))
+    flow = fluid.Fluid(meshes.box([20 * D] * 2, size=5 * D, origin=[-10 * D] * 2), density=WATER, viscosity=VISCOSITY)
+    for boundary in flow.mesh.boundary_names:
+        flow.wall(boundary)
+    flow.mean_pressure(0.0)
+    both = coupling.Coupling(sim, flow, kernel="hat", fluid_moves=False)
+    for x in np.random.default_rng(0).uniform(-9, 9, (200, 2)) * D:
+        sim.position = x[None]
+        both.step(1e-3)
+
+
+def test_a_grain_on_the_face_of_an_element_weighs_nothing_negative():
+    """Of its coordinates there one may be below 0, by rounding."""
+    for seed in range(20):
+        x = lattice((4, 4, 4), [12 * D] * 3, [-6 * D] * 3) + np.random.default_rng(seed).integers(-3, 4, (64, 3)) * D / 4
+        flow = fluid.Fluid(meshes.box([12 * D] * 3, [4] * 3, periodic=[True] * 3, origin=[-6 * D] * 3), density=WATER, viscosity=VISCOSITY)
+        flow.mean_pressure(0.0)
+        coupling.Coupling(simulation(3, x, period=[12 * D] * 3), flow, kernel="hat").step(1e-3)
+
+
+def shear_cell(grains_move):
+    """A bed between plates that slide past each other, as the fluid and the grains in it do: the flow is simple shear already."""
+    width, height, speed = 12 * D, 15 * D, 0.1
+    x = lattice((9, 11), (width, height), (-width / 2, -height / 2), jitter=0.3)
+    sim = simulation(2, x, period=(width, None))
+    sim.velocity = np.column_stack([2 * speed * x[:, 1] / height, 0 * x[:, 0]])
+    flow = fluid.Fluid(meshes.box([width, height], [4, 5], periodic=[True, False], origin=[-width / 2, -height / 2]), density=WATER, viscosity=0.1)
+    flow.permeable("top", velocity=(speed, 0.0)), flow.permeable("bottom", velocity=(-speed, 0.0))
+    flow.set_velocity(np.column_stack([2 * speed * flow.nodes[:, 1] / height, 0 * flow.nodes[:, 0]]))
+    return sim, flow, coupling.Coupling(sim, flow, grains_move=grains_move), 2 * speed / height
+
+
+def test_drag_makes_no_viscosity_of_its_own():
+    """Grains that go with a sheared fluid feel no drag, wherever their kernel ends, and the plates feel the fluid's viscosity only."""
+    sim, flow, both, rate = shear_cell(True)
+    report = both.step(1e-5)
+    drag = np.linalg.norm(both.drag_force, axis=1).max()
+    assert drag < 0.01 * sim.mass[0] * rate / 1e-5 * D  # of what a grain would feel that is a diameter off
+    traction = 0.1 * rate * 12 * D
+    assert -flow.force("top")[0] == pytest.approx(traction, rel=0.2) and flow.force("bottom")[0] == pytest.approx(traction, rel=0.2)
+    assert report.momentum_error < 1e-9
+
+
+def test_a_velocity_that_is_set_stays_when_grains_come():
+    """The flux is that of the void fraction that comes first."""
+    flow = fluid.Fluid(meshes.box([1, 1], [4, 4]), density=1.0, viscosity=1.0)
+    flow.set_velocity((1.0, 2.0))
+    flow.void_fraction = 0.4
+    assert np.allclose(flow.velocity, (1.0, 2.0), rtol=1e-14)
+
+
+def test_a_cell_open_on_both_sides_does_not_drift():
+    """Loads on the plates cancel, the pressure outside is the same on both: nothing moves the whole, however the pressure jumps at the plates."""
+    x = lattice((9, 12), (12 * D, 14 * D), (-6 * D, -7 * D), jitter=0.6)
+    sim = simulation(2, x, period=(12 * D, None))
+    lower = sim.add_plane((0, -7.2 * D), (0, 1), load=(None, 0.1), velocity=(-0.05, None))
+    upper = sim.add_plane((0, 7.2 * D), (0, -1), load=(None, -0.1), velocity=(0.05, None))
+    flow = fluid.Fluid(meshes.box([12 * D, 14.4 * D], [4, 4], periodic=[True, False], origin=[-6 * D, -7.2 * D]), density=WATER, viscosity=0.05)
+    for name, wall in (("bottom", lower), ("top", upper)):
+        flow.permeable(name, velocity=(wall.velocity[0], 0.0), pressure=0.0)
+    both = coupling.Coupling(sim, flow)
+    both.follow("bottom", lower), both.follow("top", upper)
+    for _ in range(300):
+        both.step(1e-3)
+    drift = (sim.mass * sim.velocity[:, 1]).sum() / sim.mass.sum()
+    assert abs(drift) < 0.2 * sim.velocity[:, 1].std()
+    assert abs(lower.position[1] + upper.position[1]) < 0.2 * D
