@@ -11,6 +11,10 @@ using meshes::place;
 
 namespace {
 
+// Vectors as long as registers are, or a multiple of it: sums over splines are of whole ones.
+template <int n>
+using Padded = Eigen::Matrix<double, (n + 3) / 4 * 4, 1>;
+
 double seconds() { return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count(); }
 
 }  // namespace
@@ -101,9 +105,9 @@ void Coupling<dim>::locate() {
 // What the flow is and does where each grain is.
 template <int dim>
 void Coupling<dim>::tell_grains() {
-  using Values = Eigen::Matrix<double, 3 * dim, 1>;
-  std::vector<Values> at_nodes(mesh_->nodes.size());
-  for (std::size_t k = 0; k < at_nodes.size(); ++k) at_nodes[k] << flow_.velocity[k], flow_.pressure_gradient[k], flow_.viscous_force[k];
+  using Values = Padded<3 * dim>;
+  std::vector<Values> at_nodes(mesh_->nodes.size(), Values::Zero());
+  for (std::size_t k = 0; k < at_nodes.size(); ++k) at_nodes[k].template head<3 * dim>() << flow_.velocity[k], flow_.pressure_gradient[k], flow_.viscous_force[k];
   const std::vector<Values> at_carriers = kernel_.to_carriers(at_nodes, Values(Values::Zero()));
   const std::size_t n = x_.size();
   u_.resize(n), u_mean_.resize(n), grad_p_.resize(n), stress_force_.resize(n), eps_at_.resize(n);
@@ -117,31 +121,38 @@ void Coupling<dim>::tell_grains() {
   }
 }
 
+// (1 + k/n)^-n
+template <int dim>
+double Coupling<dim>::left_of(double k) const {
+  return sub_steps_ == 1 ? 1 / (1 + k) : std::exp(-sub_steps_ * std::log1p(k / sub_steps_));
+}
+
 // c of the text above.
 template <int dim>
 double Coupling<dim>::share_of(double k) const {
+  if (sub_steps_ == 1) return k / (1 + k);
   if (k < 1e-4) return 0.5 * k * (1 + 1.0 / sub_steps_);  // to rounding, where the formula loses digits
   return 1 + std::expm1(-sub_steps_ * std::log1p(k / sub_steps_)) / k;
 }
 
-// Drag of the chosen grains about these slips, F(|w|) w/|w|; growth: d ln gamma/d ln |w|.
+// Drag of the chosen grains about these slips, F(|w|) w/|w|. growth: d ln gamma/d ln |w|, that of a single sphere by Dallavalle's law, whatever the law: it
+// makes steps from one linearisation to the next good ones, the answer does not depend on it.
 template <int dim>
 void Coupling<dim>::linearise(const std::vector<int>& which, const std::vector<Vec<dim>>& slip, std::vector<double>& growth) {
-  constexpr double more = 1e-4;
   std::vector<Suspension> seen;
-  for (const double factor : {1.0, 1.0 + more})
-    for (const int i : which) {
-      double eps = eps_at_[i];
-      if (dim == 2 && settings.discs == Discs::spheres) eps = void_fraction_of_spheres(eps);
-      seen.push_back({2 * r_[i], eps, factor * slip[i].norm(), fluid_.properties.density, fluid_.properties.viscosity});
-    }
+  for (const int i : which) {
+    double eps = eps_at_[i];
+    if (dim == 2 && settings.discs == Discs::spheres) eps = void_fraction_of_spheres(eps);
+    seen.push_back({2 * r_[i], eps, slip[i].norm(), fluid_.properties.density, fluid_.properties.viscosity});
+  }
   std::vector<double> gamma(seen.size());
   settings.drag(seen, gamma);
   for (std::size_t k = 0; k < which.size(); ++k) {
     const int i = which[k];
     if (!(gamma[k] >= 0 && std::isfinite(gamma[k])))
       fail("Coupling: the drag law gives {} kg/s for grain {}: slip {} m/s, void fraction {}, diameter {} m", gamma[k], i, seen[k].slip, seen[k].eps, seen[k].diameter);
-    growth[i] = gamma[k] > 0 ? std::clamp(std::log(gamma[which.size() + k] / gamma[k]) / std::log1p(more), 0.0, 2.0) : 0.0;
+    const double inertial = 0.63 * std::sqrt(seen[k].reynolds());
+    growth[i] = inertial / (inertial + 4.8);
     const double scale = dim == 2 ? per_depth(settings.discs, 2 * r_[i]) : 1.0;
     drag_[i] = {scale * gamma[k] * (1 + growth[i]), slip[i] * (growth[i] / (1 + growth[i]))};
   }
@@ -160,7 +171,7 @@ void Coupling<dim>::expect_drag(double dt) {
     std::vector<int> again;
     for (const int i : which) {
       if (!free_[i] || !settings.grains_move) continue;
-      const double k = dt * drag_[i].gamma / m_[i], left = std::exp(-sub_steps_ * std::log1p(k / sub_steps_));
+      const double k = dt * drag_[i].gamma / m_[i], left = left_of(k);
       const Vec<dim> rest = m_[i] * grains_.gravity + stress_force_[i];
       // Without drag it would fall freely; with it, it tends to u - shift + rest/gamma.
       const Vec<dim> end = k > 1e-8 ? Vec<dim>(u_[i] - drag_[i].shift + rest / drag_[i].gamma) : Vec<dim>(v_[i] + dt / m_[i] * rest);
@@ -196,13 +207,13 @@ void Coupling<dim>::answer_as_last(double dt) {
 
 template <int dim>
 void Coupling<dim>::set_reaction(double dt) {
-  using Values = Eigen::Matrix<double, 3 * dim + 2, 1>;  // beta, yield, beta target, force, follows
+  using Values = Padded<3 * dim + 2>;  // beta, yield, beta target, force, follows
   const Values zero = Values::Zero();
   std::vector<Values> to_carriers(kernel_.carriers(), zero);
   for (std::size_t i = 0; i < x_.size(); ++i) {
     const Answer& answer = answer_[i];
-    Values values;
-    values << answer.beta, answer.yield, answer.beta * (answer.v + drag_[i].shift - u_before_[i]), answer.given + answer.yield * answer.grad_p + carry_[i] / dt, Vec<dim>::Zero();
+    Values values = zero;
+    values.template head<3 * dim + 2>() << answer.beta, answer.yield, answer.beta * (answer.v + drag_[i].shift - u_before_[i]), answer.given + answer.yield * answer.grad_p + carry_[i] / dt, Vec<dim>::Zero();
     for (int axis = 0; axis < dim; ++axis)
       if (!(held_[i] >> axis & 1)) values[2 + 2 * dim + axis] = solid_volume_of(static_cast<int>(i));
     kernel_.give(static_cast<int>(i), values, to_carriers);
@@ -252,6 +263,7 @@ Report<dim> Coupling<dim>::step(double dt) {
     eps_ = kernel_.to_nodes(to_carriers, 0.0);
     for (std::size_t k = 0; k < eps_.size(); ++k) eps_[k] = 1 - eps_[k] / kernel_.masses()[k];
     fluid_.set_void_fraction(eps_);
+    if (!started_) flow_ = fluid_.projected();  // of the void fraction that it starts with
   } else {
     flow_ = fluid_.projected();
     eps_ = fluid_.void_fraction();

@@ -106,6 +106,7 @@ class Coupling {
 
   void take_grains();
   void locate();
+  double left_of(double k) const;
   double share_of(double k) const;
   void expect_drag(double dt);
   void linearise(const std::vector<int>& which, const std::vector<Vec<dim>>& slip, std::vector<double>& growth);

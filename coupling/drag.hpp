@@ -24,10 +24,10 @@ struct Suspension {      // what a sphere sees
 // The exponent 2 - chi is model A's, whose drag is eps times the weight less buoyancy of a settling grain.
 inline double di_felice(const Suspension& s) {
   const double re = s.reynolds();
-  const double off = re > 0 ? 1.5 - std::log10(re) : 40.0;
+  const double off = re > 1e-4 ? 1.5 - std::log10(re) : 6.0;  // 1e-7 of 3.7 by then
   const double chi = 3.7 - 0.65 * std::exp(-0.5 * off * off);
   const double sphere = 0.63 * std::sqrt(re) + 4.8;
-  return std::numbers::pi / 8 * s.viscosity * s.diameter * sphere * sphere * std::pow(s.eps, 1 - chi);
+  return std::numbers::pi / 8 * s.viscosity * s.diameter * sphere * sphere * std::exp((1 - chi) * std::log(s.eps));
 }
 
 // D. Gidaspow, Multiphase flow and fluidization (1994): S. Ergun, Chem. Eng. Prog. 48 (1952) below eps = 0.8,

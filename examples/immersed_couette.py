@@ -85,10 +85,12 @@ class Immersed(Scene):
 
 
 class Stresses:
-    """Shear stress across planes of constant y, summed over samples: contacts, motion of grains, fluid [Pa]."""
+    """Shear stress across planes of constant y, means over slabs of three diameters: contacts, motion of grains, fluid [Pa]."""
 
     def __init__(self, flags):
-        self.flags, self.planes = flags, np.linspace(0, 1, max(10, round(flags.height / (4 * RADIUS))) + 1)
+        self.flags = flags
+        self.slabs = max(6, round(flags.height / (6 * RADIUS)))  # averages over as many slabs of planes
+        self.planes = (np.arange(8 * self.slabs) + 0.5) / (8 * self.slabs)
         self.samples = []  # (time, stress at planes, 3 parts)
 
     def sample(self, scene):
@@ -103,7 +105,7 @@ class Stresses:
         up = x[j, 1] > start
         ends = np.where(up[:, None], np.column_stack([start, x[j, 1]]), np.column_stack([x[j, 1], start]))
         on_upper = np.where(up, force[:, 0], -force[:, 0])
-        stress = np.zeros((3, len(y)))
+        stress = np.zeros((3, len(y)))  # contacts, motion, fluid
         first, last = np.searchsorted(y, ends[:, 0], "left"), np.searchsorted(y, ends[:, 1], "left")
         crossing = np.bincount(first, on_upper, len(y) + 1) - np.bincount(last, on_upper, len(y) + 1)
         stress[0] = np.cumsum(crossing)[:-1] / width
@@ -111,8 +113,7 @@ class Stresses:
         slices = np.clip(np.digitize(x[:, 1], (y[1:] + y[:-1]) / 2), 0, len(y) - 1)
         mass, v = sim.mass, sim.velocity
         sums = [np.bincount(slices, weight, len(y)) for weight in (mass, mass * v[:, 0], mass * v[:, 1], mass * v[:, 0] * v[:, 1])]
-        thickness = np.gradient(y)
-        thickness[[0, -1]] /= 1  # half slices at the walls
+        thickness = y[1] - y[0]
         with np.errstate(invalid="ignore", divide="ignore"):
             stress[1] = np.nan_to_num(sums[3] - sums[1] * sums[2] / sums[0]) / (width * thickness)
         # The fluid's, of the elements on both sides of a plane: mean slope of u_x along x.
@@ -124,7 +125,7 @@ class Stresses:
         slope = np.diff(mean) / np.diff(height)
         middles = (height[1:] + height[:-1]) / 2
         stress[2] = -self.flags.viscosity * np.interp(y, middles, slope)
-        self.samples.append((sim.time, stress))
+        self.samples.append((sim.time, stress.reshape(3, self.slabs, -1).mean(axis=2)))
 
     def state(self):
         return {"time": np.array([t for t, _ in self.samples]), "stress": np.array([s for _, s in self.samples])} if self.samples else {}
@@ -133,7 +134,7 @@ class Stresses:
         self.samples = list(zip(state.get("time", []), state.get("stress", [])))
 
     def mean(self, start):
-        """Over time >= start: (3, planes); None without samples."""
+        """Over time >= start: (3, slabs); None without samples."""
         chosen = [stress for time, stress in self.samples if start is not None and time >= start]
         return np.mean(chosen, axis=0) if chosen else None
 
@@ -168,7 +169,7 @@ def immersed_results(results, scene, run, stresses, flags):
     volume = flags.width * height
     stress = variation = None
     if parts is not None:
-        y = stresses.planes * results["h"]
+        y = (np.arange(stresses.slabs) + 0.5) / stresses.slabs * results["h"]
         inside = (y >= 4 * RADIUS) & (y <= results["h"] - 4 * RADIUS)
         total = parts.sum(axis=0)[inside]
         stress, variation = total.mean(), np.abs(total / total.mean() - 1).max()
@@ -210,7 +211,7 @@ def plot(results, scene, run, profile, stresses, flags):
     if parts is not None:
         names = ("contacts", "motion of grains", "fluid", "all")
         colours = (study.BLUE, study.FAINT, "tab:green", study.RED)
-        lines = [(name, colour, stresses.planes * results["h"], -values) for name, colour, values in zip(names, colours, [*parts, parts.sum(axis=0)])]
+        lines = [(name, colour, (np.arange(stresses.slabs) + 0.5) / stresses.slabs * results["h"], -values) for name, colour, values in zip(names, colours, [*parts, parts.sum(axis=0)])]
         study.plot_lines(flags.out / "shear_stress.png", "y [m]", r"$-\tau$ [Pa]", [("", lines)], scales=("linear", "linear"))
     study.plot_snapshot(flags.out / "snapshot.png", scene.sim, *scene.faces, scene.fixed_grains(), title=f"$t$ = {scene.sim.time:.3g} s")
 

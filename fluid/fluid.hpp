@@ -206,6 +206,12 @@ class Fluid {
   template <class Use>
   void loads(const char* function, const std::string& boundary, Use&& use) const;
   std::vector<int> node_numbers() const;
+  struct InElement {
+    Vec<dim> u;        // [m/s]
+    Mat<dim> stress;   // 2 eta D(u) [Pa]
+    double eps;
+  };
+  InElement flow_in(int element, const Barycentric<dim>& l, const Geometry<dim>& g) const;
   Vec<dim> mesh_velocity_at(int node) const;
   std::vector<std::pair<int, Vec<dim>>> facet_nodes(int facet) const;
   void spread_surplus(const char* function, const std::vector<double>& x, const TimeWeights& time, std::vector<double>& missing) const;

@@ -73,8 +73,9 @@ void Fluid<dim>::judge_elements(Report& report, const std::vector<double>& x, do
   report.peclet = properties.density * std::sqrt(peclet) / properties.viscosity;
 }
 
-// Calls use(point, force): what the fluid does to a boundary, the pressure at the facets' quadrature points, the viscous traction at nodes.
-// Where boundaries meet, each has its share of a node, by area.
+// Calls use(point, force): what the fluid and what is in it do to a boundary by pressure and viscous stress. The fluid's share of the viscous
+// traction, eps, is that of its momentum balance at nodes, with the drag there; where boundaries meet, each has its share of a node, by area. Pressure, and
+// the rest of the traction, which acts on what is in the fluid, at the facets' quadrature points.
 template <int dim>
 template <class Use>
 void Fluid<dim>::loads(const char* function, const std::string& boundary, Use&& use) const {
@@ -90,13 +91,14 @@ void Fluid<dim>::loads(const char* function, const std::string& boundary, Use&& 
     const FacetView<dim> facet(*mesh_, position_, f);
     if (mesh_->facet_elements[f][1] < 0)
       for (const auto& [node, x] : facet_nodes(f))
-        use(x, Vec<dim>(-facet.area.norm() / area[node] / eps_[1][node] * Eigen::Map<const Vec<dim>>(&reaction_at_nodes_[space_.first_dof[node]])));
+        use(x, Vec<dim>(-facet.area.norm() / area[node] * Eigen::Map<const Vec<dim>>(&reaction_at_nodes_[space_.first_dof[node]])));
     const auto& corners = mesh_->elements[facet.element];
     along<dim>(facet, [&](const Barycentric<dim>& l, double weight) {
       Vec<dim> x = Vec<dim>::Zero();
       double p = 0.0;
       for (int a = 0; a <= dim; ++a) x += l[a] * position_[corners[a]], p += l[a] * x_[0][space_.pressure_dof(space_.vertex[corners[a]])];
-      use(x, Vec<dim>(weight * p * facet.area));
+      const InElement there = flow_in(facet.element, l, facet.geometry);
+      use(x, Vec<dim>(weight * (p * facet.area - (1 - there.eps) * (there.stress * facet.area))));
     });
   }
 }
@@ -206,39 +208,37 @@ double Fluid<dim>::yield_at(const std::array<int, dim + 1>& corners, const Baryc
 }
 
 template <int dim>
-auto Fluid<dim>::projected() const -> Projected {
-  const std::vector<Vec<dim>> none(space_.nodes(), Vec<dim>::Zero());
-  Projected sum{none, none, none};
-  struct There {
-    Vec<dim> u;
-    Mat<dim> stress;  // 2 eta D(u)
-  };
-  auto flow = [&]<int order>(std::integral_constant<int, order>, int element, const Barycentric<dim>& l, const Geometry<dim>& g) {
-    constexpr int n = shape_count<dim, order>;
+auto Fluid<dim>::flow_in(int element, const Barycentric<dim>& l, const Geometry<dim>& g) const -> InElement {
+  double eps = 0.0;
+  Vec<dim> flux = Vec<dim>::Zero(), grad_eps = Vec<dim>::Zero();
+  Mat<dim> slope = Mat<dim>::Zero();
+  with_order(velocity_order(), [&]<int order>(std::integral_constant<int, order>) {
     const auto shape = shapes<dim, order>(l);
     const auto grad = shape_gradients<dim, order>(l, g.grad_l);
-    double eps = 0.0;
-    Vec<dim> flux = Vec<dim>::Zero(), grad_eps = Vec<dim>::Zero();
-    Mat<dim> slope = Mat<dim>::Zero();
-    for (int a = 0; a < n; ++a) {
-      const int node = space_.node_of[element * n + a];
+    for (int a = 0; a < shape_count<dim, order>; ++a) {
+      const int node = space_.node_of[element * space_.per_element + a];
       const Vec<dim> here = Eigen::Map<const Vec<dim>>(&x_[0][space_.first_dof[node]]);
       eps += shape[a] * eps_[1][node], grad_eps += eps_[1][node] * grad[a];
       flux += shape[a] * here, slope += here * grad[a].transpose();
     }
-    There there{flux / eps, {}};
-    slope = (slope - there.u * grad_eps.transpose()) / eps;
-    there.stress = properties.viscosity * (slope + slope.transpose());
-    return there;
-  };
-  with_order(velocity_order(), [&]<int order>(std::integral_constant<int, order> constant) {
+  });
+  const Vec<dim> u = flux / eps;
+  slope = (slope - u * grad_eps.transpose()) / eps;
+  return {u, properties.viscosity * (slope + slope.transpose()), eps};
+}
+
+template <int dim>
+auto Fluid<dim>::projected() const -> Projected {
+  const std::vector<Vec<dim>> none(space_.nodes(), Vec<dim>::Zero());
+  Projected sum{none, none, none};
+  with_order(velocity_order(), [&]<int order>(std::integral_constant<int, order>) {
     for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
       const auto& corners = mesh_->elements[e];
       const Geometry<dim> g = geometry<dim>(position_, corners);
       Vec<dim> grad_p = Vec<dim>::Zero();
       for (int a = 0; a <= dim; ++a) grad_p += x_[0][space_.pressure_dof(space_.vertex[corners[a]])] * g.grad_l[a];
       for (const auto& point : quadrature<dim, order>()) {
-        const There there = flow(constant, static_cast<int>(e), point.l, g);
+        const InElement there = flow_in(static_cast<int>(e), point.l, g);
         const double weight = point.weight * g.volume;
         for (int a = 0; a <= dim; ++a) {
           const int node = space_.vertex[corners[a]];
@@ -252,7 +252,7 @@ auto Fluid<dim>::projected() const -> Projected {
       if (mesh_->facet_elements[f][1] >= 0) continue;
       const FacetView<dim> facet(*mesh_, position_, static_cast<int>(f));
       along<dim>(facet, [&](const Barycentric<dim>& l, double weight) {
-        const Vec<dim> traction = weight * flow(constant, facet.element, l, facet.geometry).stress * facet.area;
+        const Vec<dim> traction = weight * flow_in(facet.element, l, facet.geometry).stress * facet.area;
         for (int a = 0; a <= dim; ++a) sum.viscous_force[space_.vertex[mesh_->elements[facet.element][a]]] += l[a] * traction;
       });
     }
