@@ -135,19 +135,19 @@ void Kernel<dim>::splines_at(const Vec<dim>& x, int* spline, double* b) const {
     along[k] = {g * g * g / 6, 2.0 / 3 - f * f * (1 - 0.5 * f), 2.0 / 3 - g * g * (1 - 0.5 * g), f * f * f / 6};
     for (int m = 0; m < 4; ++m) {
       int n = static_cast<int>(cell) - 1 + m - first_[k];
-      if (periodic_[k] > 0) n = ((n % periodic_[k]) + periodic_[k]) % periodic_[k];
+      for (; periodic_[k] > 0 && n < 0;) n += periodic_[k];
+      for (; periodic_[k] > 0 && n >= periodic_[k];) n -= periodic_[k];
       number[k][m] = std::clamp(n, 0, count_[k] - 1);  // of a grain that rounding puts beyond the mesh
     }
   }
-  for (int m = 0; m < splines; ++m) {
-    int flat = 0;
-    double product = 1.0;
-    for (int k = dim - 1; k >= 0; --k) {
-      const int one = m >> (2 * k) & 3;
-      flat = flat * count_[k] + number[k][one], product *= along[k][one];
+  int at = 0;
+  for (int last = 0; last < 4; ++last)
+    for (int middle = 0; middle < (dim == 3 ? 4 : 1); ++middle) {
+      int row = number[dim - 1][last];
+      double product = along[dim - 1][last];
+      if constexpr (dim == 3) row = row * count_[1] + number[1][middle], product *= along[1][middle];
+      for (int m = 0; m < 4; ++m, ++at) spline[at] = row * count_[0] + number[0][m], b[at] = product * along[0][m];
     }
-    spline[m] = flat, b[m] = product;
-  }
 }
 
 template <int dim>

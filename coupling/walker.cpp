@@ -5,7 +5,8 @@
 namespace quicksand::coupling {
 
 template <int dim>
-Walker<dim>::Walker(std::shared_ptr<const Mesh<dim>> mesh, const Vec<dim>& period) : mesh_(std::move(mesh)), nodes_(mesh_->nodes), period_(period), low_(nodes_[0]) {
+Walker<dim>::Walker(std::shared_ptr<const Mesh<dim>> mesh, const Vec<dim>& period) : mesh_(std::move(mesh)), period_(period), low_(mesh_->nodes[0]) {
+  place(mesh_->nodes);
   for (const Vec<dim>& x : nodes_) low_ = low_.cwiseMin(x);
   auto key = [](auto facet) {
     std::sort(facet.begin(), facet.end());
@@ -29,6 +30,13 @@ Walker<dim>::Walker(std::shared_ptr<const Mesh<dim>> mesh, const Vec<dim>& perio
 }
 
 template <int dim>
+void Walker<dim>::place(const std::vector<Vec<dim>>& nodes) {
+  nodes_ = nodes, locator_.reset();
+  geometry_.clear();
+  for (const auto& element : mesh_->elements) geometry_.push_back(fluid::geometry<dim>(nodes_, element));
+}
+
+template <int dim>
 Vec<dim> Walker<dim>::wrap(Vec<dim> x) const {
   for (int k = 0; k < dim; ++k)
     if (period_[k] > 0) x[k] -= period_[k] * std::floor((x[k] - low_[k]) / period_[k]);
@@ -41,7 +49,7 @@ Place<dim> Walker<dim>::find(const Vec<dim>& x, const Place<dim>& before) {
   int boundary = -1;
   for (int steps = 0; steps < 200; ++steps) {  // a walk may go round in circles on slender elements: then the grid decides
     const auto& corners = mesh_->elements[now.element];
-    const auto g = fluid::geometry<dim>(nodes_, corners);
+    const auto& g = geometry_[now.element];
     int lowest = 0;
     for (int a = 0; a <= dim; ++a) {
       now.l[a] = 1.0 + g.grad_l[a].dot(x - nodes_[corners[a]]);

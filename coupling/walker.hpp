@@ -24,7 +24,7 @@ class Walker {
  public:
   Walker(std::shared_ptr<const Mesh<dim>> mesh, const Vec<dim>& period);
 
-  void place(const std::vector<Vec<dim>>& nodes) { nodes_ = nodes, locator_.reset(); }
+  void place(const std::vector<Vec<dim>>& nodes);
   // The point moved by whole periods into those of the mesh.
   Vec<dim> wrap(Vec<dim> x) const;
   // From where it was, x wrapped.
@@ -33,6 +33,7 @@ class Walker {
  private:
   std::shared_ptr<const Mesh<dim>> mesh_;
   std::vector<Vec<dim>> nodes_;
+  std::vector<fluid::Geometry<dim>> geometry_;  // of each element
   Vec<dim> period_, low_;
   std::vector<std::array<int, dim + 1>> across_;  // of each element and corner, the element beyond the facet opposite, or -1 - its boundary
   std::optional<fluid::Locator<dim>> locator_;    // where a walk ends at the boundary: the domain need not be convex
