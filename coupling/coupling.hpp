@@ -31,6 +31,7 @@
 #include "grains/simulation.hpp"
 
 #include <limits>
+#include <map>
 
 namespace quicksand::coupling {
 

@@ -75,9 +75,9 @@ def test_a_program_may_use_the_meshes_and_one_that_does_not_needs_no_gmsh(prefix
     run(*configure, "-B", tmp_path / "dry", "-DCMAKE_DISABLE_FIND_PACKAGE_gmsh=ON")
 
 
-def test_a_program_may_solve_a_flow(prefix, tmp_path):
+def test_a_program_may_solve_a_flow_with_grains(prefix, tmp_path):
     (tmp_path / "flow.cpp").write_text("""
-        #include <quicksand/fluid/fluid.hpp>
+        #include <quicksand/coupling/coupling.hpp>
         #include <quicksand/meshes/shapes.hpp>
         #include <cstdio>
         using namespace quicksand::fluid;
@@ -86,13 +86,21 @@ def test_a_program_may_solve_a_flow(prefix, tmp_path):
           flow.set_wall("walls", {});
           flow.solve_steady();
           std::printf("%.6f\\n", flow.probe(std::array{Vec<2>(1.0, 0.5)})[0].velocity[0]);
+          quicksand::Simulation<2> grains(Vec<2>(2.0, 0.0));
+          grains.set_friction("grain", "grain", 0.3);
+          grains.add(std::array{Vec<2>(0.0, 0.5)}, std::array{0.01}, 2.0, {}, {}, "grain");
+          quicksand::coupling::Settings settings;
+          settings.kernel_radius = 0.1, settings.drag = quicksand::coupling::of_each(quicksand::coupling::di_felice);
+          quicksand::coupling::Coupling<2> both(grains, flow, settings);
+          for (int k = 0; k < 5; ++k) both.step(1.0);
+          std::printf("%d\\n", both.drag_force()[0][0] != 0.0);
         }""")
     (tmp_path / "CMakeLists.txt").write_text("cmake_minimum_required(VERSION 3.25)\nproject(flow LANGUAGES CXX)\nset(CMAKE_CXX_STANDARD 20)\n"
-                                             "find_package(quicksand REQUIRED COMPONENTS fluid)\n"
-                                             "add_executable(flow flow.cpp)\ntarget_link_libraries(flow quicksand::fluid)\n")
+                                             "find_package(quicksand REQUIRED COMPONENTS coupling)\n"
+                                             "add_executable(flow flow.cpp)\ntarget_link_libraries(flow quicksand::coupling)\n")
     run("cmake", "-G", "Ninja", "-S", tmp_path, f"-DCMAKE_PREFIX_PATH={prefix}", "-B", tmp_path / "build")
     run("cmake", "--build", tmp_path / "build")
-    assert run(tmp_path / "build" / "flow") == "3.000000\n"  # rho g h^2 / (8 eta)
+    assert run(tmp_path / "build" / "flow") == "3.000000\n1\n"  # rho g h^2 / (8 eta)
 
 
 def test_one_version_everywhere():
