@@ -51,7 +51,6 @@ Coupling<dim>::Coupling(Simulation<dim>& grains, fluid::Fluid<dim>& fluid, Setti
     fluid_.settings.linear->tolerance = 1e-13;
     fluid_.grains_follow = settings.grains_move;
   }
-  flow_ = fluid_.projected();
 }
 
 template <int dim>
@@ -249,7 +248,6 @@ Report<dim> Coupling<dim>::step(double dt) {
     nodes.resize(mesh_->nodes.size());
     walker_.place(nodes);
     kernel_.place(nodes);
-    flow_ = fluid_.projected();
   }
   take_grains();
   const int before = removed_;
@@ -263,12 +261,11 @@ Report<dim> Coupling<dim>::step(double dt) {
     eps_ = kernel_.to_nodes(to_carriers, 0.0);
     for (std::size_t k = 0; k < eps_.size(); ++k) eps_[k] = 1 - eps_[k] / kernel_.masses()[k];
     fluid_.set_void_fraction(eps_);
-    if (!started_) flow_ = fluid_.projected();  // of the void fraction that it starts with
   } else {
-    flow_ = fluid_.projected();
     eps_ = fluid_.void_fraction();
     eps_.resize(mesh_->nodes.size());
   }
+  flow_ = fluid_.projected();  // on the mesh as it is now
   tell_grains();
   expect_drag(dt);
   answer_as_expected(dt);
@@ -378,7 +375,6 @@ void Coupling<dim>::restore(std::span<const double> state) {
     carry_[i] = Eigen::Map<const Vec<dim>>(at), at += dim;
   }
   for (auto& [boundary, follow] : follows_) follow->from = Eigen::Map<const Vec<dim>>(at), at += dim;
-  flow_ = fluid_.projected();
 }
 
 template class Coupling<2>;

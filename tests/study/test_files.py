@@ -108,7 +108,7 @@ def test_a_run_killed_at_any_moment_can_be_read_and_goes_on_bit_for_bit(unbroken
     chance, kills, out = random.Random(1), 0, tmp_path / "first"
     start = ["--out", out, *CELL, "--checkpoint-every", "0.01"]
     args, finished = start, 0
-    while kills < 20 or not finished:
+    while kills < 8 or not finished:
         process = subprocess.Popen(command(*args), env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         try:
             assert process.wait(chance.uniform(0.3, 1.5)) == 0, process.stderr.read()
