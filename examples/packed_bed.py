@@ -1,0 +1,364 @@
+"""Flow through a random bed of grains: its pressure gradient against the drag law, and when the bed fluidises.
+
+    ./run examples/packed_bed.py --periodic --fixed --mesh-over-d 3
+    ./run examples/packed_bed.py --open --free
+    ./run examples/packed_bed.py --fluidise
+
+Beds are random: points in a periodic box whose spheres are pushed apart until none overlap. `error` is that of the mean pressure gradient, against
+(1 - eps)/V gamma u_s/eps at the bed's eps and the superficial velocity found, u_s = U/eps the slip (3D; gamma of discs is that of spheres, per volume of solids).
+
+--periodic  a box of 24 d (3D: 12 d) that repeats along all axes; a body force on the fluid, what the law says for --velocity, stands for the pressure gradient
+--open      a bed 24 d (3D: 10 d) wide between two layers of clear fluid, which comes in at the top; gradient and porosity in the middle, away from the
+            ends by the kernel's reach and two elements: the kernel smears the ends. The middle is 24 d deep in 2D, 10 d in 3D.
+--fixed     the grains are held
+--free      they are not. Periodic: they get the opposite body force, so that all forces add up to zero, and are packed more densely than they jam,
+            with overlaps of a percent, which contact dynamics takes for contacts and leaves: they hold each other. Open: they settle on a screen, then the flow presses them on it.
+--fluidise  3D or 2D, a bed that has settled under gravity on the screen, through which the flow comes; its velocity rises step by step. Minimum
+            fluidisation is where the line through the pressure drops of the bed still at rest, against drag law times a factor, meets the weight less buoyancy
+            per area; the law's is where its gradient at the bed's porosity is (1 - eps) (rho_s - rho_f) g.
+
+Flags
+    --dim 2|3            (2)
+    --diameter D         [m] (1e-3)
+    --velocity U         superficial [m/s] (1e-4)
+    --viscosity E        [Pa s] (1e-3)
+    --density R          of the grains [kg/m^3] (2500)
+    --fluid-density R    [kg/m^3] (1000)
+    --drag LAW           di_felice, gidaspow or beetstra (di_felice)
+    --mesh-over-d R      element length [-] (3)
+    --kernel NAME        smooth or hat (smooth)
+    --kernel-over-d R    its standard deviation [-] (1.5)
+    --element NAME       p1p1 or p2p1 (p1p1)
+    --stiffness K        k = dt gamma/m, which sets the time step [-] (1e4; --fluidise 1)
+    --periodic | --open, --fixed | --free, --fluidise    (--periodic --fixed)
+    --seed N             of the bed (0)
+    --quick              --fluidise: fewer velocities
+    --out DIR            results.json, bed.png (out/packed_bed)
+
+results.json
+    porosity                            1 - N V/volume; open: in the middle [-]
+    pressure_drop pressure_drop_law     over the box, or over the middle; fluidised: the last [Pa]
+    error                               pressure_drop/pressure_drop_law - 1 [-]
+    velocity_found                      superficial [m/s]
+    velocity_mf velocity_mf_law error_mf   minimum fluidisation [m/s] [m/s] [-]; null without --fluidise
+    plateau                             mean drop above 1.1 of it over the weight less buoyancy per area [-]; null likewise
+    void_fraction_min                   at nodes: a field that reaches 0 ends the run [-]
+    grain_speed                         fastest grain over the superficial velocity, at the end [-]
+    overlap                             periodic: largest of two grains, over d [-]
+    grains steps dt                     [-] [-] [s]
+    unconverged_steps                   of the grains, sub-steps accepted above the tolerance; null where they are held
+    momentum_error volume_error carried_impulse   largest of a step after the first [-]
+    fluid_share exchange_share grains_share       of wall_time [-]
+    wall_time dofs                      [s]; unknowns
+"""
+
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.spatial import cKDTree
+from scipy.stats import qmc
+
+from quicksand import coupling, fluid, grains, meshes, study
+
+GRAVITY = 9.81  # m/s^2
+SOLIDS = {2: 0.75, 3: 0.56}  # dense, below the density at which random packings jam (0.84 and 0.64)
+SETTLE = 0.03  # time step over sqrt(d/g)
+JAMMED = {2: 0.86, 3: 0.66}  # above it: each grain is held by overlaps of a percent, which contact dynamics takes for contacts and leaves
+
+
+def spheres_void_fraction(eps):
+    """Of spheres packed as closely as the discs."""
+    return 1 - 2 / np.sqrt(np.pi * np.sqrt(3)) * (1 - eps) ** 1.5
+
+
+def gradient(flags, eps, superficial):
+    """The law's pressure gradient in a uniform bed [Pa/m]."""
+    slip = superficial / eps
+    seen = eps if flags.dim == 3 else spheres_void_fraction(eps)
+    gamma = coupling.drag_coefficient(flags.drag, slip, seen, flags.diameter, flags.fluid_density, flags.viscosity)
+    return (1 - eps) / (np.pi * flags.diameter**3 / 6) * gamma * slip / eps
+
+
+def random_bed(lengths, solids, seed):
+    """Positions about 0 of grains of diameter 1 in a periodic box: random points, moved apart until no pair overlaps, or, where there is no room for that,
+    for a few thousand rounds; and the largest overlap left."""
+    dim, box = len(lengths), np.array(lengths, float)
+    count = round(solids * box.prod() / (np.pi / 4 if dim == 2 else np.pi / 6))
+    # Points spread more evenly than independent ones: without the clusters and holes that would be channels for the flow.
+    x = qmc.Halton(dim, seed=seed).random(int(1.1 * count * box.max() ** dim / box.prod()) + 50) * box.max()
+    x = x[(x < box).all(axis=1)][:count]
+    for _ in range(3000):
+        x %= box
+        pairs = cKDTree(x, boxsize=box).query_pairs(1.001, output_type="ndarray")  # a little larger than they are: rounds would grow in vain as pairs just touch
+        apart = x[pairs[:, 0]] - x[pairs[:, 1]]
+        apart -= box * np.round(apart / box)
+        distance = np.linalg.norm(apart, axis=1)
+        if distance.min() > 1.0:
+            break
+        push = 0.3 * ((1.001 - distance) / distance)[:, None] * apart
+        for axis in range(dim):
+            x[:, axis] += np.bincount(pairs[:, 0], push[:, axis], count) - np.bincount(pairs[:, 1], push[:, axis], count)
+    return x - box / 2, max(0.0, 1.0 - distance.min())
+
+
+def base(flags, lengths, periodic, origin, gravity):
+    d = flags.diameter
+    cells = [max(2, round(length / flags.mesh_over_d)) for length in lengths]
+    mesh = meshes.box([length * d for length in lengths], cells, periodic=periodic, origin=[a * d for a in origin])
+    flow = fluid.Fluid(mesh, density=flags.fluid_density, viscosity=flags.viscosity, element=flags.element, gravity=gravity)
+    sim = grains.Simulation(dim=flags.dim, period=[length * d if p else None for length, p in zip(lengths, periodic)])
+    sim.set_friction("grain", "grain", 0.5), sim.set_friction("grain", "wall", 0.5)
+    sim.tolerance = 1e-2  # with a contact wrong by 6e-4 d in a step at most; of k = 1e4 that is 1e-4 of the slip
+    return flow, sim
+
+
+def couple(flags, sim, flow, grains_move):
+    return coupling.Coupling(sim, flow, kernel=flags.kernel, kernel_radius=flags.kernel_over_d * flags.diameter, drag=flags.drag, grains_move=grains_move)
+
+
+def superficial_velocity(flow, axis):
+    """Mean of eps u over the mesh [m/s]; of linear elements, up to the product of two linear functions."""
+    corners = flow.mesh.elements
+    x = flow.nodes[corners]
+    weight = np.abs(np.linalg.det(x[:, 1:] - x[:, :1]))
+    n = len(flow.mesh.nodes)
+    eps, u = flow.void_fraction[:n][corners], flow.velocity[:n, axis][corners]
+    mean = (eps.sum(axis=1) * u.sum(axis=1) + (eps * u).sum(axis=1)) / ((flow.dim + 1) * (flow.dim + 2))  # exact for linear eps and u
+    return (weight * mean).sum() / weight.sum()
+
+
+def solid(flags):
+    return np.pi * flags.diameter**2 / 4 if flags.dim == 2 else np.pi * flags.diameter**3 / 6
+
+
+def time_step(flags, sim, eps):
+    """k relaxation times of a grain."""
+    gamma = gradient(flags, eps, flags.velocity) * eps * solid(flags) / (1 - eps) / (flags.velocity / eps)
+    return flags.stiffness * sim.mass[0] / gamma
+
+
+def through(both, sim, sim_moves, dt, stiffness, speed, reports):
+    """Steps until the flow is steady; a free bed gives way to its load first, in steps that grow from 0.1 relaxation times on."""
+    if sim_moves:
+        sim.accept_unconverged = True
+        for k in np.geomspace(0.1, max(stiffness, 0.2), 24):
+            both.step(dt * min(k / stiffness, 1))
+    before = 0.0
+    for _ in range(5 if sim_moves else 300):
+        reports.append(both.step(dt))
+        now = speed()
+        if abs(now - before) <= 1e-6 * abs(now):
+            break
+        before = now
+
+
+def run_periodic(flags):
+    side = 24 if flags.dim == 2 else 12
+    x, overlap = random_bed([side] * flags.dim, (JAMMED if flags.free else SOLIDS)[flags.dim], flags.seed)
+    length = side * flags.diameter
+    eps = 1 - len(x) * solid(flags) / length**flags.dim
+    driven = gradient(flags, eps, flags.velocity)
+    flow, sim = base(flags, [side] * flags.dim, [True] * flags.dim, [-side / 2] * flags.dim, [driven / flags.fluid_density] + [0.0] * (flags.dim - 1))
+    flow.mean_pressure(0.0)
+    sim.add(x * flags.diameter, flags.diameter / 2, density=flags.density)
+    if flags.free:
+        flow.set_velocity([flags.velocity / eps] + [0.0] * (flags.dim - 1))  # momentum is kept: from rest the bed would drift
+        sim.gravity = [-driven * eps * length**flags.dim / sim.mass.sum()] + [0.0] * (flags.dim - 1)
+    both, reports = couple(flags, sim, flow, flags.free), []
+    dt = time_step(flags, sim, eps)
+    start = time.perf_counter()
+    through(both, sim, flags.free, dt, flags.stiffness, lambda: superficial_velocity(flow, 0), reports)
+    found = superficial_velocity(flow, 0) - sim.mass @ sim.velocity[:, 0] / sim.mass.sum()
+    return flow, sim, reports, time.perf_counter() - start, {
+        "porosity": eps, "pressure_drop": driven * length, "pressure_drop_law": gradient(flags, eps, found) * length, "velocity_found": found, "dt": dt, "overlap": overlap}, None
+
+
+def settle(flags, sim):
+    """Onto the screen, under gravity in the absence of fluid, and to rest."""
+    sim.gravity = [0.0] * (flags.dim - 1) + [-GRAVITY]
+    kept, sim.tolerance = sim.tolerance, 1e-3
+    for _ in range(400):
+        sim.step(SETTLE * np.sqrt(flags.diameter / GRAVITY))
+    sim.tolerance = kept
+    sim.velocity, sim.spin = 0 * sim.velocity, 0 * sim.spin
+
+
+def middle(y, low, high):
+    """A window of mean 1, J. von Hann's: sharp ends would cut the porosity of a slice with an error of a layer's."""
+    s = (y - low) / (high - low)
+    return np.where((s > 0) & (s < 1), 2 * np.sin(np.pi * np.clip(s, 0, 1)) ** 2, 0.0)
+
+
+def porosity_of(sim, flags, low, high, area):
+    """Of the grains between two heights, as `middle` weighs them."""
+    return 1 - solid(flags) * middle(sim.position[:, -1], low, high).sum() / (area * (high - low))
+
+
+def section_pressure(flow, flags, heights, width):
+    """Mean over horizontal sections (n,) [Pa]."""
+    rows = (np.arange(24) + 0.5) / 24 * width - width / 2
+    across = np.stack(np.meshgrid(*[rows[:: 1 if flags.dim == 2 else 3]] * (flags.dim - 1), indexing="ij"), -1).reshape(-1, flags.dim - 1)
+    points = np.concatenate([np.column_stack([across, np.full(len(across), y)]) for y in heights])
+    return flow.probe(points)["pressure"].reshape(len(heights), -1).mean(axis=1)
+
+
+def end_of(flags):
+    """How far the end of a bed is smeared [d]: weights reach as far as the kernel and an element, and the void fraction and the pressure one more."""
+    return 3.3 * flags.kernel_over_d * (flags.kernel == "smooth") + 2 * flags.mesh_over_d
+
+
+def standing_bed(flags, gravity, clear):
+    """A bed on a screen at height 0, `clear` fluid below and above [d], settled where it is free; and its height [m]."""
+    d, width = flags.diameter, 24 if flags.dim == 2 else 10
+    depth = 20 if flags.fluidise else int(np.ceil(2 * end_of(flags))) + width
+    x, _ = random_bed([width] * (flags.dim - 1) + [depth], SOLIDS[flags.dim], flags.seed)
+    periodic = [True] * (flags.dim - 1) + [False]
+    lengths = [width] * (flags.dim - 1) + [depth + 1 + sum(clear)]
+    flow, sim = base(flags, lengths, periodic, [-width / 2] * (flags.dim - 1) + [-clear[0]], gravity)
+    if flags.free:
+        sim.add_plane([0.0] * flags.dim, [0.0] * (flags.dim - 1) + [1.0])
+    x[:, -1] += depth / 2 + 0.5
+    sim.add(x * d, d / 2, density=flags.density)
+    if flags.free:
+        settle(flags, sim)
+    return flow, sim, width * d, np.quantile(sim.position[:, -1], 0.98)
+
+
+def run_open(flags):
+    d = flags.diameter
+    clear = np.ceil(4 * flags.kernel_over_d + 2 * flags.mesh_over_d)
+    flow, sim, width, top = standing_bed(flags, [0.0] * flags.dim, (clear, clear))
+    flow.inflow("top" if flags.dim == 2 else "front", [0.0] * (flags.dim - 1) + [-flags.velocity])
+    flow.outflow("bottom" if flags.dim == 2 else "back")
+    sim.gravity = [0.0] * flags.dim
+    low, high = end_of(flags) * d, top - end_of(flags) * d
+    eps = porosity_of(sim, flags, low, high, width ** (flags.dim - 1))
+    both, reports = couple(flags, sim, flow, flags.free), []
+    dt = time_step(flags, sim, eps)
+    heights = np.linspace(low, high, 101)
+    start = time.perf_counter()
+    through(both, sim, flags.free, dt, flags.stiffness, lambda: section_pressure(flow, flags, heights[:1], width)[0], reports)
+    seconds = time.perf_counter() - start
+    eps = porosity_of(sim, flags, low, high, width ** (flags.dim - 1))
+    pressure = section_pressure(flow, flags, heights, width)
+    drop = (np.diff(pressure) * middle((heights[1:] + heights[:-1]) / 2, low, high)).sum()
+    law = gradient(flags, eps, flags.velocity)
+    whole = np.linspace(-clear * d * 0.99, top + clear * d * 0.99, 200)
+    return flow, sim, reports, seconds, {
+        "porosity": eps, "pressure_drop": drop, "pressure_drop_law": law * (high - low), "velocity_found": flags.velocity, "dt": dt}, (
+        "$y/d$", [("$p$ [Pa]", [("law, in the middle", study.FAINT, heights / d, pressure.mean() + law * (heights - heights.mean())),
+                                ("fluid", study.BLUE, whole / d, section_pressure(flow, flags, whole, width))])])
+
+
+def run_fluidised(flags):
+    d, flags.free = flags.diameter, True
+    flow, sim, width, top = standing_bed(flags, [0.0] * (flags.dim - 1) + [-GRAVITY], (0, 12))
+    sim.gravity = [0.0] * (flags.dim - 1) + [-GRAVITY]
+    area = width ** (flags.dim - 1)
+    eps = porosity_of(sim, flags, d, top - d, area)
+    less = (flags.density - flags.fluid_density) * GRAVITY
+    law = brentq(lambda u: gradient(flags, eps, u) - (1 - eps) * less, 1e-12, 10.0, xtol=1e-16)
+    weight = sim.count * solid(flags) * less / area
+    now = [0.0]
+    bottom, lid = ("bottom", "top") if flags.dim == 2 else ("back", "front")
+    flow.inflow(bottom, lambda x, t: np.tile([0.0] * (flags.dim - 1) + [now[0]], (len(x), 1)))
+    flow.outflow(lid)
+    both, reports = couple(flags, sim, flow, True), []
+    flags.velocity = law
+    dt = time_step(flags, sim, eps)
+    ratios = np.arange(0.2, 1.601, 0.1 if flags.quick else 0.05)
+    height = flow.nodes[:, -1].max()
+    speeds, drops = [], []
+    start = time.perf_counter()
+    for ratio in ratios:
+        now[0] = ratio * law
+        for hold in range(10 if flags.quick else 30):
+            reports.append(both.step(dt))
+            if hold >= (5 if flags.quick else 15):
+                speeds.append(now[0])
+                drops.append(section_pressure(flow, flags, [0.0], width)[0] - flags.fluid_density * GRAVITY * height)
+    seconds = time.perf_counter() - start
+    speeds, drops = np.array(speeds), np.array(drops)
+    at = np.unique(speeds)
+    mean = np.array([drops[speeds == u].mean() for u in at])
+    rest = mean < 0.9 * weight
+    factor = (mean / [gradient(flags, eps, u) for u in at])[rest].mean()  # a depth [m]: that of the bed, as the kernel has it
+    measured = brentq(lambda u: factor * gradient(flags, eps, u) - weight, 1e-12, 10.0, xtol=1e-16)
+    return flow, sim, reports, seconds, {
+        "porosity": eps, "pressure_drop": mean[-1], "pressure_drop_law": weight, "velocity_found": at[-1], "dt": dt, "velocity_mf": measured, "velocity_mf_law": law,
+        "error_mf": measured / law - 1, "plateau": mean[at > 1.1 * measured].mean() / weight}, (
+        "$U/U_{mf}$ of the law", [("drop / (weight less buoyancy)", [("at rest", study.FAINT, at / law, np.minimum(factor * np.array([gradient(flags, eps, u) for u in at]) / weight, 1)),
+                                                                    ("bed", study.BLUE, at / law, mean / weight)])])
+
+
+def parse_flags():
+    parser = study.CommandLine(__doc__)
+    parser.add_argument("--dim", type=int, choices=(2, 3), default=2)
+    parser.add_argument("--diameter", type=study.number("m", above=0), default=1e-3)
+    parser.add_argument("--velocity", type=study.number("m/s", above=0), default=1e-4)
+    parser.add_argument("--viscosity", type=study.number("Pa s", above=0), default=1e-3)
+    parser.add_argument("--density", type=study.number("kg/m^3", above=0), default=2500.0)
+    parser.add_argument("--fluid-density", type=study.number("kg/m^3", above=0), default=1000.0)
+    parser.add_argument("--drag", choices=coupling.LAWS, default="di_felice")
+    parser.add_argument("--mesh-over-d", type=study.number("", above=0), default=3.0)
+    parser.add_argument("--kernel", choices=("smooth", "hat"), default="smooth")
+    parser.add_argument("--kernel-over-d", type=study.number("", above=0), default=1.5)
+    parser.add_argument("--element", choices=("p1p1", "p2p1"), default="p1p1")
+    parser.add_argument("--stiffness", type=study.number("", above=0))
+    ends, held = parser.add_mutually_exclusive_group(), parser.add_mutually_exclusive_group()
+    ends.add_argument("--periodic", dest="open", action="store_false")
+    ends.add_argument("--open", action="store_true")
+    held.add_argument("--fixed", dest="free", action="store_false")
+    held.add_argument("--free", action="store_true")
+    parser.add_argument("--fluidise", action="store_true")
+    parser.add_argument("--seed", type=study.whole(at_least=0), default=0)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--out", type=Path, default=Path("out/packed_bed"))
+    parser.set_defaults(open=False, free=False)
+    flags = parser.parse_args()
+    flags.stiffness = flags.stiffness or (1.0 if flags.fluidise else 1e4)
+    if flags.fluidise and flags.density <= flags.fluid_density:
+        parser.error(f"argument --density: must be above that of the fluid, {flags.fluid_density:g} kg/m^3, for a bed that rests on its screen, got {flags.density:g}")
+    return parser, flags
+
+
+def measure(flags):
+    """Results, and what to plot."""
+    kept = {name: value for name, value in vars(flags).items() if name not in ("out", "quick")}
+    flow, sim, reports, seconds, results, curves = (run_fluidised if flags.fluidise else run_open if flags.open else run_periodic)(flags)
+    results = kept | {"velocity_mf": None, "velocity_mf_law": None, "error_mf": None, "plateau": None, "overlap": None} | results
+    results |= {"error": results["pressure_drop"] / results["pressure_drop_law"] - 1, "void_fraction_min": flow.void_fraction.min(),
+                "grain_speed": np.abs(sim.velocity).max() / results["velocity_found"], "grains": sim.count, "steps": len(reports)}
+    results |= {"unconverged_steps": sum(r.grains.unconverged for r in reports)} if flags.free else {"unconverged_steps": None}
+    results |= {name: max(getattr(r, name) for r in reports[1:] or reports) for name in ("momentum_error", "volume_error", "carried_impulse")}
+    results |= {f"{part}_share": sum(getattr(r, f"{part}_time") for r in reports) / seconds for part in ("fluid", "exchange", "grains")}
+    return results | {"wall_time": seconds, "dofs": flow.dofs}, flow, curves
+
+
+def main():
+    parser, flags = parse_flags()
+    with parser.user_errors(ValueError, OSError, MemoryError, fluid.NotConverged, grains.NotConverged):
+        flags.out.mkdir(parents=True, exist_ok=True)
+        results, flow, curves = measure(flags)
+        study.write_results(flags.out / "results.json", results)
+    if curves:
+        study.plot_along(flags.out / "bed.png", *curves)
+    elif flags.dim == 2:
+        n = len(flow.mesh.nodes)
+        study.plot_flow(flags.out / "bed.png", flow.mesh, [("void fraction [-]", flow.void_fraction[:n], None, None),
+                                                           ("speed [m/s]", np.linalg.norm(flow.velocity[:n], axis=1), None, flow.velocity[:n])])
+    units = {"porosity": "-", "pressure_drop": "Pa", "error": "-", "velocity_mf": "m/s", "plateau": "-", "void_fraction_min": "-", "grain_speed": "-", "momentum_error": "-",
+             "volume_error": "-", "carried_impulse": "-", "grains": "", "steps": "", "dofs": "", "wall_time": "s"}
+    references = {"pressure_drop": f"{results['pressure_drop_law']:.6g}", "error": "0", "momentum_error": "0", "volume_error": "0"}
+    if flags.fluidise:
+        references |= {"velocity_mf": f"{results['velocity_mf_law']:.6g}", "plateau": "1"}
+    kind = "open at both ends" if flags.open else "periodic"
+    study.print_summary("A bed fluidises" if flags.fluidise else f"A {'free' if flags.free else 'held'} bed, {kind}, in {flags.dim}D", results, units, references, "law", digits=6)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
