@@ -175,6 +175,12 @@ class Simulation {
   void weigh(double h);
   void unweigh();
   void note_contacts();
+  template <class Visit>
+  void each_loaded_contact(Visit&& visit) const {  // between grains, of the last sub-step
+    for (std::size_t b = 0; b < count_.size(); ++b)
+      for (int k = neighbours_.blocks[b].begin; k < neighbours_.blocks[b].begin + count_[b]; ++k)
+        if (contacts_[k].p.n > 0) visit(contacts_[k]);
+  }
   bool dragged() const { return !drag_.coefficient.empty(); }
   void account(double h, StepReport<dim>& report);
   void move(double h);

@@ -94,6 +94,15 @@ Simulation<dim> column(int layers) {
   return sim;
 }
 
+// Of a gas of 64 grains.
+template <int dim>
+constexpr std::array<int, dim> cells() {
+  if constexpr (dim == 2)
+    return {8, 8};
+  else
+    return {4, 4, 4};
+}
+
 // Grains of radii 0.8 to 1.2 mm near the points of a square or cubic lattice of spacing 3 mm around 0, with random velocities up
 // to `speed` along each axis. Adds cells[0] x cells[1] (x cells[2]) of them.
 template <int dim>

@@ -11,14 +11,6 @@ template <class D>
 class Balances : public ::testing::Test {};
 TYPED_TEST_SUITE(Balances, Dimensions, DimensionName);
 
-template <int dim>
-constexpr std::array<int, dim> cells() {
-  if constexpr (dim == 2)
-    return {8, 8};
-  else
-    return {4, 4, 4};
-}
-
 // 64 grains with friction and restitution that collide in a box periodic along every axis.
 template <int dim>
 Simulation<dim> gas(double normal, double tangential) {

@@ -136,14 +136,6 @@ TYPED_TEST(Drag, a_rising_fluid_holds_a_stack_under_a_ceiling) {
   for (const Vec<dim>& v : velocities(sim)) EXPECT_LT(v.norm(), 1e-8);
 }
 
-template <int dim>
-constexpr std::array<int, dim> cells() {
-  if constexpr (dim == 2)
-    return {8, 8};
-  else
-    return {4, 4, 4};
-}
-
 // Everything at once: a periodic gas on a floor, with friction, both restitutions, and drag from none to stiff.
 template <int dim>
 Simulation<dim> dragged_gas(double speed) {
