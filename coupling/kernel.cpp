@@ -135,8 +135,8 @@ void Kernel<dim>::splines_at(const Vec<dim>& x, int* spline, double* b) const {
     along[k] = {g * g * g / 6, 2.0 / 3 - f * f * (1 - 0.5 * f), 2.0 / 3 - g * g * (1 - 0.5 * g), f * f * f / 6};
     for (int m = 0; m < 4; ++m) {
       int n = static_cast<int>(cell) - 1 + m - first_[k];
-      for (; periodic_[k] > 0 && n < 0;) n += periodic_[k];
-      for (; periodic_[k] > 0 && n >= periodic_[k];) n -= periodic_[k];
+      while (periodic_[k] > 0 && n < 0) n += periodic_[k];
+      while (periodic_[k] > 0 && n >= periodic_[k]) n -= periodic_[k];
       number[k][m] = std::clamp(n, 0, count_[k] - 1);  // of a grain that rounding puts beyond the mesh
     }
   }

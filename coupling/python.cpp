@@ -1,6 +1,8 @@
 // quicksand.coupling in Python.
 #include "coupling.hpp"
 
+#include "fluid/words.hpp"
+
 #include <fmt/format.h>
 #include <pybind11/eigen.h>
 #include <pybind11/numpy.h>
@@ -23,21 +25,14 @@ Array to_numpy(const std::vector<T>& values) {
   return Array(shape, reinterpret_cast<const double*>(values.data()));
 }
 
-template <class T>
-T one_of(const char* what, const std::string& name, const std::vector<std::pair<std::string, T>>& known) {
-  std::string names;
-  for (const auto& [word, value] : known) {
-    if (name == word) return value;
-    names += (names.empty() ? "\"" : ", \"") + word + "\"";
-  }
-  throw std::invalid_argument(fmt::format("Coupling: {} must be one of {}, got \"{}\"", what, names, name));
-}
+using fluid::one_of, fluid::Words;
+using Law = double (*)(const Suspension&);
+constexpr Words<Law> laws = {{"di_felice", di_felice}, {"gidaspow", gidaspow}, {"beetstra", beetstra}};
+constexpr Words<Shape> kernels = {{"smooth", Shape::smooth}, {"hat", Shape::hat}};
+constexpr Words<Discs> kinds_of_discs = {{"spheres", Discs::spheres}, {"cylinders", Discs::cylinders}};
 
 DragLaw drag_law(const py::object& law) {
-  if (!PyCallable_Check(law.ptr())) {
-    using Law = double (*)(const Suspension&);
-    return of_each(one_of<Law>("drag", py::cast<std::string>(law), {{"di_felice", di_felice}, {"gidaspow", gidaspow}, {"beetstra", beetstra}}));
-  }
+  if (!PyCallable_Check(law.ptr())) return of_each(one_of("Coupling: drag", py::cast<std::string>(law), laws));
   return [law](std::span<const Suspension> seen, std::span<double> gamma) {
     if (seen.empty()) return;
     std::vector<double> slip, eps, diameter;
@@ -81,10 +76,10 @@ void bind(py::module_& m, const char* suffix) {
       .def(py::init([](Simulation<dim>& grains, fluid::Fluid<dim>& fluid, const std::string& kernel, double radius, const py::object& drag, const std::string& discs, bool fluid_moves,
                        bool grains_move) {
              coupling::Settings settings;
-             settings.kernel = one_of<Shape>("kernel", kernel, {{"smooth", Shape::smooth}, {"hat", Shape::hat}});
+             settings.kernel = one_of("Coupling: kernel", kernel, kernels);
              settings.kernel_radius = radius;
              settings.drag = drag_law(drag);
-             settings.discs = one_of<Discs>("discs", discs, {{"spheres", Discs::spheres}, {"cylinders", Discs::cylinders}});
+             settings.discs = one_of("Coupling: discs", discs, kinds_of_discs);
              settings.fluid_moves = fluid_moves, settings.grains_move = grains_move;
              return std::make_unique<C>(grains, fluid, std::move(settings));
            }),

@@ -145,7 +145,7 @@ std::vector<Vec<dim>> Fluid<dim>::quadrature_points() const {
 template <int dim>
 std::vector<double> Fluid<dim>::quadrature_weights() const {
   std::vector<double> weights;
-  each_point([&](const auto&, const auto&, const int*, double weight) { weights.push_back(weight); });
+  each_point([&](const auto&, const int*, double weight) { weights.push_back(weight); });
   return weights;
 }
 
@@ -178,15 +178,14 @@ void Fluid<dim>::set_reaction(std::vector<Reaction<dim>> reaction) {
   });
 }
 
-// Calls use(shapes, their gradients, velocity nodes, weight) at the quadrature points of all elements.
+// Calls use(shapes, velocity nodes, weight) at the quadrature points of all elements.
 template <int dim>
 template <class Use>
 void Fluid<dim>::each_point(Use&& use) const {
   with_order(velocity_order(), [&]<int order>(std::integral_constant<int, order>) {
     for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
-      const Geometry<dim> g = geometry<dim>(position_, mesh_->elements[e]);
-      for (const auto& point : quadrature<dim, order>())
-        use(shapes<dim, order>(point.l), shape_gradients<dim, order>(point.l, g.grad_l), &space_.node_of[e * space_.per_element], point.weight * g.volume);
+      const double volume = geometry<dim>(position_, mesh_->elements[e]).volume;
+      for (const auto& point : quadrature<dim, order>()) use(shapes<dim, order>(point.l), &space_.node_of[e * space_.per_element], point.weight * volume);
     }
   });
 }
@@ -282,7 +281,7 @@ void Fluid<dim>::keep_advance() {
 template <int dim>
 std::vector<Vec<dim>> Fluid<dim>::advances(const std::vector<double>& x, double dt) const {
   std::vector<Vec<dim>> all;
-  each_point([&](const auto& shape, const auto&, const int* node, double) {
+  each_point([&](const auto& shape, const int* node, double) {
     std::array<double, 2> eps{};
     std::array<Vec<dim>, 2> flux{Vec<dim>::Zero(), Vec<dim>::Zero()};
     for (std::size_t a = 0; a < shape.size(); ++a)

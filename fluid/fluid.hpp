@@ -212,6 +212,8 @@ class Fluid {
     double eps;
   };
   InElement flow_in(int element, const Barycentric<dim>& l, const Geometry<dim>& g) const;
+  double pressure_in(int element, const Barycentric<dim>& l) const;
+  Vec<dim> pressure_slope(int element, const Geometry<dim>& g) const;
   Vec<dim> mesh_velocity_at(int node) const;
   std::vector<std::pair<int, Vec<dim>>> facet_nodes(int facet) const;
   void spread_surplus(const char* function, const std::vector<double>& x, const TimeWeights& time, std::vector<double>& missing) const;
@@ -232,7 +234,7 @@ class Fluid {
   std::optional<double> mean_pressure_;
   std::vector<Vec<dim>> position_, old_position_;  // of mesh nodes, now and at the start of the step
   std::vector<Vec<dim>> mesh_velocity_, old_mesh_velocity_;  // of mesh nodes
-  std::vector<double> marked_;
+  std::vector<double> marked_;                     // by mark(), with the next
   double marked_move_ = 0.0;
   double moved_for_ = 0.0;                         // length of the coming step where move() was called, else 0 [s]
   std::array<std::vector<double>, 3> eps_;         // at velocity nodes: now, one and two steps ago

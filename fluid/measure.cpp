@@ -95,10 +95,9 @@ void Fluid<dim>::loads(const char* function, const std::string& boundary, Use&& 
     const auto& corners = mesh_->elements[facet.element];
     along<dim>(facet, [&](const Barycentric<dim>& l, double weight) {
       Vec<dim> x = Vec<dim>::Zero();
-      double p = 0.0;
-      for (int a = 0; a <= dim; ++a) x += l[a] * position_[corners[a]], p += l[a] * x_[0][space_.pressure_dof(space_.vertex[corners[a]])];
+      for (int a = 0; a <= dim; ++a) x += l[a] * position_[corners[a]];
       const InElement there = flow_in(facet.element, l, facet.geometry);
-      use(x, Vec<dim>(weight * (p * facet.area - (1 - there.eps) * (there.stress * facet.area))));
+      use(x, Vec<dim>(weight * (pressure_in(facet.element, l) * facet.area - (1 - there.eps) * (there.stress * facet.area))));
     });
   }
 }
@@ -130,9 +129,8 @@ auto Fluid<dim>::error(const VectorField<dim>& velocity, const ScalarField<dim>&
     const double volume = geometry<dim>(position_, corners).volume;
     for (const auto& point : quadrature<dim, 2>()) {
       Vec<dim> where = Vec<dim>::Zero();
-      double value = 0.0;
-      for (int a = 0; a <= dim; ++a) where += point.l[a] * position_[corners[a]], value += point.l[a] * x_[0][space_.pressure_dof(space_.vertex[corners[a]])];
-      x.push_back(where), p.push_back(value), weight.push_back(point.weight * volume);
+      for (int a = 0; a <= dim; ++a) where += point.l[a] * position_[corners[a]];
+      x.push_back(where), p.push_back(pressure_in(static_cast<int>(e), point.l)), weight.push_back(point.weight * volume);
       u.push_back(velocity_in(static_cast<int>(e), point.l));
     }
   }
@@ -162,6 +160,20 @@ Vec<dim> Fluid<dim>::velocity_in(int element, const Barycentric<dim>& l, int ste
 }
 
 template <int dim>
+double Fluid<dim>::pressure_in(int element, const Barycentric<dim>& l) const {
+  double p = 0.0;
+  for (int a = 0; a <= dim; ++a) p += l[a] * x_[0][space_.pressure_dof(space_.vertex[mesh_->elements[element][a]])];
+  return p;
+}
+
+template <int dim>
+Vec<dim> Fluid<dim>::pressure_slope(int element, const Geometry<dim>& g) const {
+  Vec<dim> slope = Vec<dim>::Zero();
+  for (int a = 0; a <= dim; ++a) slope += x_[0][space_.pressure_dof(space_.vertex[mesh_->elements[element][a]])] * g.grad_l[a];
+  return slope;
+}
+
+template <int dim>
 auto Fluid<dim>::probe(std::span<const Vec<dim>> x) const -> std::vector<Probe> {
   const Locator<dim> locator(*mesh_, position_);
   std::vector<Probe> found;
@@ -169,15 +181,8 @@ auto Fluid<dim>::probe(std::span<const Vec<dim>> x) const -> std::vector<Probe> 
     const auto where = point.allFinite() ? locator.find(point) : std::nullopt;
     if (!where) fail("probe: {} m (point {}) is not inside the mesh", place(point), found.size());
     const auto& [element, l] = *where;
-    const auto& corners = mesh_->elements[element];
-    Probe probe{Vec<dim>::Zero(), 0.0, Vec<dim>::Zero()};
-    const Geometry<dim> g = geometry<dim>(position_, corners);
-    for (int a = 0; a <= dim; ++a) {
-      const double p = x_[0][space_.pressure_dof(space_.vertex[corners[a]])];
-      probe.pressure += l[a] * p, probe.pressure_gradient += p * g.grad_l[a];
-    }
-    probe.velocity = velocity_in(element, l);
-    found.push_back(probe);
+    const Geometry<dim> g = geometry<dim>(position_, mesh_->elements[element]);
+    found.push_back({velocity_in(element, l), pressure_in(element, l), pressure_slope(element, g)});
   }
   return found;
 }
@@ -192,9 +197,7 @@ void Fluid<dim>::each_open_point(Use&& use) const {
     for (const int f : facets_of_[k]) {
       const FacetView<dim> facet(*mesh_, position_, f);
       along<dim>(facet, [&](const Barycentric<dim>& l, double weight) {
-        double p = 0.0;
-        for (int a = 0; a <= dim; ++a) p += l[a] * x_[0][space_.pressure_dof(space_.vertex[mesh_->elements[facet.element][a]])];
-        use(facet, l, Vec<dim>(weight * facet.area), outer_pressure_[k][q++] - p);
+        use(facet, l, Vec<dim>(weight * facet.area), outer_pressure_[k][q++] - pressure_in(facet.element, l));
       });
     }
   }
@@ -235,8 +238,7 @@ auto Fluid<dim>::projected() const -> Projected {
     for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
       const auto& corners = mesh_->elements[e];
       const Geometry<dim> g = geometry<dim>(position_, corners);
-      Vec<dim> grad_p = Vec<dim>::Zero();
-      for (int a = 0; a <= dim; ++a) grad_p += x_[0][space_.pressure_dof(space_.vertex[corners[a]])] * g.grad_l[a];
+      const Vec<dim> grad_p = pressure_slope(static_cast<int>(e), g);
       for (const auto& point : quadrature<dim, order>()) {
         const InElement there = flow_in(static_cast<int>(e), point.l, g);
         const double weight = point.weight * g.volume;
@@ -289,10 +291,8 @@ Vec<dim> Fluid<dim>::reaction_force() const {
   with_order(velocity_order(), [&]<int order>(std::integral_constant<int, order>) {
     const auto& rule = quadrature<dim, order>();
     for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
-      const auto& corners = mesh_->elements[e];
-      const Geometry<dim> g = geometry<dim>(position_, corners);
-      Vec<dim> grad_p = Vec<dim>::Zero();
-      for (int a = 0; a <= dim; ++a) grad_p += x_[0][space_.pressure_dof(space_.vertex[corners[a]])] * g.grad_l[a];
+      const Geometry<dim> g = geometry<dim>(position_, mesh_->elements[e]);
+      const Vec<dim> grad_p = pressure_slope(static_cast<int>(e), g);
       for (std::size_t q = 0; q < rule.size(); ++q) {
         const Reaction<dim>& r = reaction_[e * rule.size() + q];
         Vec<dim> u = velocity_in(static_cast<int>(e), rule[q].l);

@@ -1,5 +1,6 @@
 // quicksand.fluid in Python: numpy arrays in and out; fields are numbers, arrays, or functions of (x, t) called with all points at once.
 #include "fluid.hpp"
+#include "words.hpp"
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -79,28 +80,10 @@ ScalarField<dim> scalar_field(const py::object& value, const char* what) {
   return [value, what](std::span<const Vec<dim>> x, double t) { return scalars(value(copied<dim>(x), t), x.size(), what); };
 }
 
-// The words for the values of a choice, both ways.
-template <class T>
-using Words = std::initializer_list<std::pair<const char*, T>>;
 constexpr Words<int> elements = {{"p1p1", 1}, {"p2p1", 2}};
 constexpr Words<Advection> advections = {{"none", Advection::none}, {"extrapolated", Advection::extrapolated}, {"newton", Advection::newton}};
 constexpr Words<Scheme> schemes = {{"bdf2", Scheme::bdf2}, {"backward_euler", Scheme::backward_euler}};
 constexpr Words<Method> methods = {{"direct", Method::direct}, {"ilu", Method::ilu}, {"fieldsplit", Method::fieldsplit}};
-
-template <class T>
-T one_of(const char* what, const std::string& name, const Words<T>& known) {
-  std::vector<std::string> names;
-  for (const auto& [word, value] : known) {
-    if (name == word) return value;
-    names.emplace_back(word);
-  }
-  throw std::invalid_argument(fmt::format("{} must be one of {}, got \"{}\"", what, names, name));
-}
-
-template <class T>
-const char* word_for(T value, const Words<T>& known) {
-  return std::find_if(known.begin(), known.end(), [&](const auto& pair) { return pair.second == value; })->first;
-}
 
 // What is given as a field and used at the quadrature points of a step.
 struct Distributed {
@@ -271,7 +254,6 @@ void add_fluid(py::module_& m, const char* name) {
       .def_property_readonly("dim", [](const F&) { return dim; })
       .def_property_readonly("mesh", [](const F& f) { return std::const_pointer_cast<Mesh<dim>>(f.space().mesh); }, "as it was at the start: `nodes` tells where it is")
       .def_property_readonly("element", [](const F& f) { return word_for(f.velocity_order(), elements); })
-      .def("reaction_force", &F::reaction_force, "Of the reaction on the fluid in the last step (dim,) [N] (2D: N/m).")
       .def("force", &F::force, "boundary"_a, "Of the fluid on a boundary (dim,) [N] (2D: N/m).")
       .def("torque",
            [](const F& f, const std::string& boundary, const py::object& centre) -> py::object {
