@@ -1,36 +1,8 @@
 """Examples of grains in a fluid: their keys, their pictures, and how near they come to the drag law."""
 
-import json
-import os
-import re
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
-import quicksand
-
-EXAMPLES = Path(__file__).parents[2] / "examples"
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(quicksand.__file__).parents[1]), "OMP_WAIT_POLICY": "passive", "OMP_NUM_THREADS": "1"}
-
-
-def go(name, out, *args):
-    return subprocess.run([sys.executable, EXAMPLES / f"{name}.py", *map(str, args), "--out", out], env=ENVIRONMENT, capture_output=True, text=True, timeout=200)
-
-
-def results(name, out, *args, pictures=()):
-    done = go(name, out, *args)
-    assert done.returncode == 0 and done.stderr == "", done.stderr
-    found = json.loads((out / "results.json").read_text())
-    text = (EXAMPLES / f"{name}.py").read_text().split('"""')[1]
-    flags = set(re.findall(r"--([a-z-]+)", text))
-    for key in found:
-        assert key.replace("_", "-") in flags or re.search(rf"\b{key}\b", text.split("results.json")[-1]), f"{key} is not in the docstring"
-    assert found["wall_time"] > 0
-    for picture in pictures:
-        assert (out / picture).stat().st_size > 10000
-    return found
+from run_examples import go, results
 
 
 # Re 0.7, 134, 2e4; the last a light grain, which rises.

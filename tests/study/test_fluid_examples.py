@@ -1,36 +1,16 @@
 """Examples of the fluid alone: their keys, their pictures, and how near they come to closed forms and published benchmarks."""
 
+import functools
 import json
-import os
 import re
 import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
-import quicksand
+import run_examples
+from run_examples import EXAMPLES, go
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(quicksand.__file__).parents[1]), "OMP_WAIT_POLICY": "passive", "OMP_NUM_THREADS": "1"}
-
-
-def go(name, out, *args):
-    return subprocess.run([sys.executable, EXAMPLES / f"{name}.py", *map(str, args), "--out", out], env=ENVIRONMENT, capture_output=True, text=True, timeout=120)
-
-
-def results(name, out, *args, pictures=("flow.png",)):
-    done = go(name, out, *args)
-    assert done.returncode == 0 and done.stderr == "", done.stderr
-    found = json.loads((out / "results.json").read_text())
-    text = (EXAMPLES / f"{name}.py").read_text().split('"""')[1]
-    flags = set(re.findall(r"--([a-z-]+)", text))
-    for key in found:
-        assert key.replace("_", "-") in flags or re.search(rf"\b{key}\b", text.split("results.json")[-1]), f"{key} is not in the docstring"
-    assert found["dofs"] > 0 and found["wall_time"] > 0
-    for picture in pictures:
-        assert (out / picture).stat().st_size > 20000
-    return found
+results = functools.partial(run_examples.results, pictures=("flow.png",), picture_bytes=20000)
 
 
 def test_the_run_line_is_that_of_the_benchmark_of_schaefer_and_turek(tmp_path):

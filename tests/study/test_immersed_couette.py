@@ -1,25 +1,21 @@
 """examples/immersed_couette.py: its balances, its limit without a fluid, a run that goes on."""
 
 import json
-import os
-import subprocess
 import sys
-from pathlib import Path
+import types
 
 import numpy as np
 import pytest
 
-import quicksand
+from run_examples import EXAMPLES, go
+from test_dry_couette import KEYS as OF_THE_DRY
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
 KEYS = """viscous_number visco_inertial_number stokes_number fluid_shear_stress mean_drag momentum_error volume_error carried_impulse fluid_share exchange_share
           grains_share plate_shear_traction shear_stress shear_stress_variation drained_volume_error fluid_step_time dofs""".split()
 
 
 def results_of(out, *args):
-    environment = os.environ | {"PYTHONPATH": str(Path(quicksand.__file__).parents[1]), "OMP_WAIT_POLICY": "passive"}
-    done = subprocess.run([sys.executable, EXAMPLES / "immersed_couette.py", "--quick", "--threads", "2", "--out", out, *map(str, args)], env=environment, capture_output=True,
-                          text=True, timeout=300)
+    done = go("immersed_couette", out, *args)
     assert done.returncode == 0, done.stderr
     return json.loads((out / "results.json").read_text()), done.stdout
 
@@ -27,14 +23,11 @@ def results_of(out, *args):
 @pytest.fixture(scope="module")
 def short(tmp_path_factory):
     out = tmp_path_factory.mktemp("short")
-    return out, *results_of(out, "--t-end", 0.6)
+    return out, *results_of(out, "--quick", "--threads", 2, "--t-end", 0.6)
 
 
 def test_results_hold_the_keys_of_the_issue_and_those_of_the_dry_example(short):
     out, results, printed = short
-    sys.path.insert(0, str(EXAMPLES.parent / "tests" / "study"))
-    from test_dry_couette import KEYS as OF_THE_DRY
-
     assert sorted(results) == sorted(OF_THE_DRY + KEYS)
     for name in ("series", "profiles", "shear_stress", "snapshot"):
         assert (out / f"{name}.png").stat().st_size > 5000
@@ -52,20 +45,14 @@ def test_balances_close(short):
 
 def test_a_run_that_is_stopped_goes_on_as_if_it_had_not_been(short, tmp_path):
     out, results, _ = short
-    results_of(tmp_path, "--t-end", 0.3, "--no-plots")
-    environment = os.environ | {"PYTHONPATH": str(Path(quicksand.__file__).parents[1]), "OMP_WAIT_POLICY": "passive"}
-    done = subprocess.run([sys.executable, EXAMPLES / "immersed_couette.py", "--restart", tmp_path / "checkpoint.h5", "--t-end", "0.6", "--no-plots"], env=environment,
-                          capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    again = json.loads((tmp_path / "results.json").read_text())
+    results_of(tmp_path, "--quick", "--threads", 2, "--t-end", 0.3, "--no-plots")
+    again, _ = results_of(tmp_path, "--restart", tmp_path / "checkpoint.h5", "--t-end", 0.6, "--no-plots")
     timed = ("wall_time", "fluid_step_time", "fluid_share", "exchange_share", "grains_share")
     assert {key: value for key, value in again.items() if key not in timed} == {key: value for key, value in results.items() if key not in timed}
 
 
 def test_a_fluid_of_no_density_and_viscosity_is_none(tmp_path):
     sys.path.insert(0, str(EXAMPLES))
-    import types
-
     import dry_couette
     import immersed_couette
 
