@@ -39,6 +39,7 @@ Coupling<dim>::Coupling(Simulation<dim>& grains, fluid::Fluid<dim>& fluid, Setti
     if (period[k] > 0 && std::abs(high[k] - low[k] - period[k]) > 1e-9 * period[k])
       fail("Coupling: the mesh must extend over one period along axis {}, {} m, but does over {}", k, period[k], high[k] - low[k]);
   }
+  if (settings.undisturbed && dim == 2) fail("Coupling: undisturbed is of spheres: the wake of a disc in slow flow is as wide as the domain");
   if (settings.fluid_moves) {
     fluid_.settings.scheme = fluid::Scheme::backward_euler;
     fluid_.reaction_on_change = true;
@@ -134,6 +135,33 @@ double Coupling<dim>::share_of(double k) const {
   return 1 + std::expm1(-sub_steps_ * std::log1p(k / sub_steps_)) / k;
 }
 
+// s of wake.hpp. The hat gives the force to the nodes a of the element, l_a to each, and the flow is read at nodes b (or where the grain is, of elements
+// of order 2); in between lie the linear field of the force and linear test functions. The first is a hat, of variance h^2/6 along an axis (of cubes in
+// tetrahedra; others by their volume). The second is one too, but for what the matrix of the same elements undoes: in the mean over directions of
+// k, sum k_i^4 = 3/5 k^4, it leaves 2/5 of it. Flow at a distance r from a force that is so spread, by directions' mean, is erf(r/(2 s))/(6 pi eta r).
+// The smooth kernel's variance adds to it.
+template <int dim>
+typename Coupling<dim>::Own Coupling<dim>::own(int i) const {
+  const auto& l = place_[i].l;
+  const auto& corners = mesh_->elements[place_[i].element];
+  const bool linear = fluid_.velocity_order() == 1;
+  double volume = 0.0, peak = 0.0;  // h^3, and what the hat makes of 1 where the grain is
+  for (int a = 0; a <= dim; ++a) volume += l[a] * kernel_.masses()[corners[a]], peak += l[a] * l[a] / kernel_.masses()[corners[a]];
+  const double s = std::cbrt(volume) * std::sqrt((linear ? 1.4 : 1.0) / 12);
+  auto at = [&](const Vec<dim>& apart) {
+    const double r = apart.norm();
+    return r < 1e-6 * s ? 1 / s : std::sqrt(std::numbers::pi) * std::erf(r / (2 * s)) / r;
+  };
+  double sum = 0.0;
+  for (int a = 0; a <= dim; ++a) {
+    const Vec<dim>& x = walker_.nodes()[corners[a]];
+    if (!linear) sum += l[a] * at(x - x_[i]);
+    else for (int b = 0; b <= dim; ++b) sum += l[a] * l[b] * at(x - walker_.nodes()[corners[b]]);
+  }
+  const double variance = std::pow(peak, -2.0 / 3) / (2 * std::numbers::pi) + kernel_.variance();
+  return {std::sqrt(1 / (sum * sum) + kernel_.variance() / 2), solid_volume_of(i) * std::pow(2 * std::numbers::pi * variance, -1.5)};
+}
+
 // Drag of the chosen grains about these slips, F(|w|) w/|w|. growth: d ln gamma/d ln |w|, that of a single sphere by Dallavalle's law, whatever the law: it
 // makes steps from one linearisation to the next good ones, the answer does not depend on it.
 template <int dim>
@@ -144,12 +172,28 @@ void Coupling<dim>::linearise(const std::vector<int>& which, const std::vector<V
     if (dim == 2 && settings.discs == Discs::spheres) eps = void_fraction_of_spheres(eps);
     seen.push_back({2 * r_[i], eps, slip[i].norm(), fluid_.properties.density, fluid_.properties.viscosity});
   }
-  std::vector<double> gamma(seen.size());
-  settings.drag(seen, gamma);
+  std::vector<double> gamma(seen.size()), gain(seen.size(), 1.0);  // gain: the slip without the grain's wake over that with it
+  for (double change = 1.0; change > 1e-9;) {
+    settings.drag(seen, gamma);
+    change = 0.0;
+    for (std::size_t k = 0; k < which.size(); ++k) {
+      const int i = which[k];
+      if (!(gamma[k] >= 0 && std::isfinite(gamma[k])))
+        fail("Coupling: the drag law gives {} kg/s for grain {}: slip {} m/s, void fraction {}, diameter {} m", gamma[k], i, seen[k].slip, seen[k].eps, seen[k].diameter);
+      if (!settings.undisturbed) continue;
+      // Others' solids, beyond what the estimate of its own may leave.
+      const double volume = solid_volume_of(i), others = std::max(0.0, 1 - eps_at_[i] - 1.5 * own_[i].solids);
+      const double wake = gamma[k] * own_wake(own_[i].spread, fluid_.properties.viscosity, fluid_.properties.density, others * gamma[k] / (volume * fluid_.properties.viscosity), seen[k].slip);
+      if (wake > 0.5)
+        fail("Coupling: undisturbed: grain {} of diameter {} m takes {} of the flow where it is along with it, more than half: take a larger kernel_radius or larger elements", i, 2 * r_[i], wake);
+      const double next = 1 / (1 - wake);
+      change = std::max(change, std::abs(next - gain[k]));
+      gain[k] = next, seen[k].slip = next * slip[i].norm();
+    }
+  }
   for (std::size_t k = 0; k < which.size(); ++k) {
     const int i = which[k];
-    if (!(gamma[k] >= 0 && std::isfinite(gamma[k])))
-      fail("Coupling: the drag law gives {} kg/s for grain {}: slip {} m/s, void fraction {}, diameter {} m", gamma[k], i, seen[k].slip, seen[k].eps, seen[k].diameter);
+    gamma[k] *= gain[k];
     const double inertial = 0.63 * std::sqrt(seen[k].reynolds());
     growth[i] = inertial / (inertial + 4.8);
     const double scale = dim == 2 ? per_depth(settings.discs, 2 * r_[i]) : 1.0;
@@ -165,6 +209,10 @@ void Coupling<dim>::expect_drag(double dt) {
   std::vector<double> growth(n);
   std::vector<int> which(n);
   for (int i = 0; i < n; ++i) slip[i] = u_[i] - v_[i], which[i] = i;
+  if (settings.undisturbed) {
+    own_.resize(n);
+    for (int i = 0; i < n; ++i) own_[i] = own(i);
+  }
   for (int rounds = 0; !which.empty() && rounds < 30; ++rounds) {
     linearise(which, slip, growth);
     std::vector<int> again;

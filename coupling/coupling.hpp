@@ -26,6 +26,7 @@
 
 #include "drag.hpp"
 #include "kernel.hpp"
+#include "wake.hpp"
 
 #include "fluid/fluid.hpp"
 #include "grains/simulation.hpp"
@@ -44,6 +45,7 @@ struct Settings {
   double kernel_radius = 0.0;  // [m]
   DragLaw drag;
   Discs discs = Discs::spheres;
+  bool undisturbed = false;    // drag by the flow without the grain's own wake (wake.hpp), spheres only
   bool fluid_moves = true;     // false: it stays what it is, and feels no grain
   bool grains_move = true;     // false: a bed that is held
   double tolerance = std::numeric_limits<double>::infinity();  // of the phases' disagreement; above it another pass is made
@@ -105,11 +107,14 @@ class Coupling {
     Vec<dim> v, given, grad_p;             // [m/s], [N], [Pa/m]
   };
 
+  struct Own { double spread, solids; };  // s of wake.hpp [m]; of 1 - eps where the grain is, its part
+
   void take_grains();
   void locate();
   double left_of(double k) const;
   double share_of(double k) const;
   void expect_drag(double dt);
+  Own own(int i) const;
   void linearise(const std::vector<int>& which, const std::vector<Vec<dim>>& slip, std::vector<double>& growth);
   void answer_as_expected(double dt);
   void answer_as_last(double dt);
@@ -139,6 +144,7 @@ class Coupling {
   std::vector<char> free_;         // bore no contact in the last step
   std::vector<std::uint8_t> held_; // by a wall, of each axis a bit
   std::vector<Drag> drag_;
+  std::vector<Own> own_;
   std::vector<Answer> answer_;
   int sub_steps_ = 1;              // of the last step
   bool started_ = false;           // the fluid's pressure is that of a flow with grains

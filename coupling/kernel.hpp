@@ -28,6 +28,8 @@ class Kernel {
   void weigh(std::span<const Vec<dim>> x, const std::vector<Place<dim>>& places);
   const std::vector<double>& masses() const { return masses_; }  // M_a of each node, of an image that of its master [m^dim]
 
+  double variance() const { return shape_ == Shape::hat ? 0.0 : 2.0 / 3 * spacing_.squaredNorm() / dim; }  // of the smooth kernel, along an axis [m^2]
+
   // From nodes (of which images count as their masters) to grains and back goes by way of carriers: splines, or for the hat the nodes themselves.
   template <class T>
   std::vector<T> to_carriers(const std::vector<T>& at_nodes, const T& zero) const;

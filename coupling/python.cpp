@@ -73,17 +73,18 @@ void bind(py::module_& m, const char* suffix) {
       .def_readonly("grains_time", &R::grains_time, "[s]")
       .def_readonly("exchange_time", &R::exchange_time, "[s]");
   py::class_<C>(m, fmt::format("Coupling{}", suffix).c_str())
-      .def(py::init([](Simulation<dim>& grains, fluid::Fluid<dim>& fluid, const std::string& kernel, double radius, const py::object& drag, const std::string& discs, bool fluid_moves,
-                       bool grains_move) {
+      .def(py::init([](Simulation<dim>& grains, fluid::Fluid<dim>& fluid, const std::string& kernel, double radius, const py::object& drag, const std::string& discs, bool undisturbed,
+                       bool fluid_moves, bool grains_move) {
              coupling::Settings settings;
              settings.kernel = one_of("Coupling: kernel", kernel, kernels);
              settings.kernel_radius = radius;
              settings.drag = drag_law(drag);
              settings.discs = one_of("Coupling: discs", discs, kinds_of_discs);
+             settings.undisturbed = undisturbed && fluid_moves;
              settings.fluid_moves = fluid_moves, settings.grains_move = grains_move;
              return std::make_unique<C>(grains, fluid, std::move(settings));
            }),
-           py::keep_alive<1, 2>(), py::keep_alive<1, 3>(), "grains"_a, "fluid"_a, "kernel"_a, "kernel_radius"_a, "drag"_a, "discs"_a, "fluid_moves"_a, "grains_move"_a)
+           py::keep_alive<1, 2>(), py::keep_alive<1, 3>(), "grains"_a, "fluid"_a, "kernel"_a, "kernel_radius"_a, "drag"_a, "discs"_a, "undisturbed"_a, "fluid_moves"_a, "grains_move"_a)
       .def("follow", [](C& c, const std::string& boundary, const py::object& wall) { c.follow(boundary, py::cast<int>(wall.attr("number"))); }, "boundary"_a, "wall"_a,
            "From now on a boundary of the mesh goes with a wall of the grains, along axes that are not periodic.")
       .def("outlet", &C::set_outlet, "boundary"_a, "Grains whose centre leaves the mesh by this boundary are removed from now on.")

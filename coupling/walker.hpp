@@ -25,6 +25,7 @@ class Walker {
   Walker(std::shared_ptr<const Mesh<dim>> mesh, const Vec<dim>& period);
 
   void place(const std::vector<Vec<dim>>& nodes);
+  const std::vector<Vec<dim>>& nodes() const { return nodes_; }
   // The point moved by whole periods into those of the mesh.
   Vec<dim> wrap(Vec<dim> x) const;
   // From where it was, x wrapped.

@@ -24,6 +24,7 @@ Flags
     --drag LAW           di_felice, gidaspow or beetstra (di_felice)
     --dt-over-tau R      time step over tau [-] (1; two-way 1000)
     --two-way            the fluid feels the grain
+    --undisturbed        two-way: drag by the flow without the grain's own wake, in 3D
     --mesh-over-d R      element length at the grain [-] (4)
     --kernel-over-d R    standard deviation of the kernel [-], 0 for the hat (1.5)
     --out DIR            results.json and velocity.png (out/terminal_velocity)
@@ -106,7 +107,7 @@ def set_up(flags):
     place = size * np.array([[0.31, 0.17, 0.23]])[:, :flags.dim]  # neither at a node nor amid some
     sim.add(place, d / 2, density=flags.density)
     options = {"kernel": "smooth", "kernel_radius": flags.kernel_over_d * d} if flags.two_way and flags.kernel_over_d > 0 else {"kernel": "hat"}
-    return flow, sim, coupling.Coupling(sim, flow, drag=flags.drag, fluid_moves=flags.two_way, **options), place, frame, force
+    return flow, sim, coupling.Coupling(sim, flow, drag=flags.drag, undisturbed=flags.undisturbed, fluid_moves=flags.two_way, **options), place, frame, force
 
 
 def parse_flags():
@@ -119,6 +120,7 @@ def parse_flags():
     parser.add_argument("--drag", choices=coupling.LAWS, default="di_felice")
     parser.add_argument("--dt-over-tau", type=study.number("", above=0))
     parser.add_argument("--two-way", action="store_true")
+    parser.add_argument("--undisturbed", action="store_true")
     parser.add_argument("--mesh-over-d", type=study.number("", above=0), default=4.0)
     parser.add_argument("--kernel-over-d", type=study.number("", at_least=0), default=1.5)
     parser.add_argument("--out", type=Path, default=Path("out/terminal_velocity"))
@@ -126,6 +128,8 @@ def parse_flags():
     flags.dt_over_tau = flags.dt_over_tau or (1000.0 if flags.two_way else 1.0)
     if flags.density == flags.fluid_density:
         parser.error(f"argument --density: must not be that of the fluid, {flags.fluid_density:g} kg/m^3: such a grain does not fall")
+    if flags.undisturbed and not (flags.two_way and flags.dim == 3):
+        parser.error("argument --undisturbed: needs --two-way and --dim 3: a fluid at rest has no wake, that of a disc is as wide as the box")
     return parser, flags
 
 

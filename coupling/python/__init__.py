@@ -5,7 +5,7 @@ from ._coupling import Coupling2D, Coupling3D, drag_coefficient
 LAWS = ("di_felice", "gidaspow", "beetstra")
 
 
-def Coupling(grains, fluid, *, kernel="smooth", kernel_radius=None, drag="di_felice", discs="spheres", fluid_moves=True, grains_move=True):
+def Coupling(grains, fluid, *, kernel="smooth", kernel_radius=None, drag="di_felice", discs="spheres", undisturbed=False, fluid_moves=True, grains_move=True):
     """Couples a `Simulation` and a `Fluid` on a mesh that holds all of its grains; `step` makes the steps of both.
 
     Parameters
@@ -27,6 +27,10 @@ def Coupling(grains, fluid, *, kernel="smooth", kernel_radius=None, drag="di_fel
     discs : str
         How discs borrow the drag of spheres: "spheres", per volume of solids, at the void fraction of equally close spheres; "cylinders": as
         published 2D computations with MigFlow, gamma 4/(pi d) per metre of depth at the void fraction of the discs.
+    undisturbed : bool
+        3D: drag by the flow as it would be without the grain, whose own averaged wake is told in closed form (steady; of unbounded flow, slowed by the
+        drag of grains around; about as long along all axes as elements are). A single grain then falls as the law says, not 5 to 25 % faster; in beds of
+        solids above 0.1 it changes next to nothing.
     fluid_moves, grains_move : bool
         False: the fluid stays as it is and feels no grain; the grains stay where they are, a porous bed.
 
@@ -41,4 +45,4 @@ def Coupling(grains, fluid, *, kernel="smooth", kernel_radius=None, drag="di_fel
         kernel_radius = 3.0 * grains.radius.mean() if grains.count else 0.0
     if grains.dim != fluid.dim:
         raise ValueError(f"Coupling: grains in {grains.dim}D, fluid in {fluid.dim}D")
-    return {2: Coupling2D, 3: Coupling3D}[fluid.dim](grains, fluid, kernel, kernel_radius, drag, discs, fluid_moves, grains_move)
+    return {2: Coupling2D, 3: Coupling3D}[fluid.dim](grains, fluid, kernel, kernel_radius, drag, discs, undisturbed, fluid_moves, grains_move)

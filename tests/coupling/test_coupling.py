@@ -325,6 +325,8 @@ def test_what_cannot_be_is_named():
         coupling.Coupling(sim, flow, kernel="gauss")
     with pytest.raises(ValueError, match="drag must be one of"):
         coupling.Coupling(sim, flow, drag="stokes")
+    with pytest.raises(ValueError, match="undisturbed is of spheres"):
+        coupling.Coupling(sim, flow, undisturbed=True)
     with pytest.raises(ValueError, match="too small for elements"):
         coupling.Coupling(sim, flow, kernel_radius=1e-2 * D)
     with pytest.raises(ValueError, match="period along axis 0"):

@@ -23,6 +23,13 @@ def test_a_grain_falls_too_fast_in_its_own_wake_the_more_so_the_narrower_that_is
     assert 0.2 > errors[0] > errors[1] > 0.02
 
 
+# Measured: -0.5, +0.6, +0.5 %; the goal is 3 %.
+@pytest.mark.parametrize("diameter, mesh_over_d", [(2.4e-5, 2), (1e-4, 6), (2.9e-4, 10)])
+def test_with_drag_by_the_undisturbed_flow_it_falls_as_the_law_says(tmp_path, diameter, mesh_over_d):
+    found = results("terminal_velocity", tmp_path, "--two-way", "--undisturbed", "--diameter", diameter, "--mesh-over-d", mesh_over_d)
+    assert abs(found["error"]) < 0.015 and found["wake_over_slip"] > 0.005
+
+
 # Random beds: where they are denser the flow goes round, the finer the elements the better. Measured -0.47, -0.01, -0.10 and -1.4 %.
 @pytest.mark.parametrize("args, most", [((), 0.005), (("--mesh-over-d", 6), 0.005), (("--dim", 3), 0.005), (("--open",), 0.02)])
 def test_a_held_bed_has_the_pressure_gradient_of_the_law(tmp_path, args, most):
@@ -56,6 +63,7 @@ def test_a_block_settles_in_a_closed_box_and_none_of_it_gets_out(tmp_path, dim):
 
 
 @pytest.mark.parametrize("name, args, says", [("packed_bed", ("--mesh-over-d", 0), "must be > 0"), ("sedimentation", ("--phi", 0.9), "at most 0.75"), ("terminal_velocity", ("--density", 1000), "does not fall"),
+                                              ("terminal_velocity", ("--undisturbed",), "needs --two-way"),
                                               ("terminal_velocity", ("--diameter", 0), "must be > 0 m")])
 def test_a_wrong_flag_is_one_line_and_status_2(tmp_path, name, args, says):
     done = go(name, tmp_path, *args)
