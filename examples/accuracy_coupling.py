@@ -111,7 +111,7 @@ def crossing(flags):
     return rows, {}
 
 
-def curves_of(results, case, x, y, dashed=None, **chosen):
+def curves_of(results, case, x, y, **chosen):
     """One for each kernel."""
     column = {key: np.array([np.nan if v is None else v for v in results[f"{case}_{key}"]], float) for key in {x, y, "kernel_over_d", *chosen}}
     here = np.all([np.isclose(column[key], value) for key, value in chosen.items()], axis=0) if chosen else np.full(len(column[x]), True)
@@ -121,13 +121,10 @@ def curves_of(results, case, x, y, dashed=None, **chosen):
 
 def plot(folder, results):
     if "wake_error" in results:
-        panels = []
-        for reynolds in sorted(set(results["wake_reynolds"])):
-            for undisturbed in (0, 1):
-                what = "error without the own wake" if undisturbed else "error"
-                panels.append((f"Re = {reynolds:.2g}: {what}", curves_of(results, "wake", "mesh_over_d", "error", reynolds=reynolds, undisturbed=undisturbed)))
-        slow = min(results["wake_reynolds"])
-        panels.append((f"Re = {slow:.2g}: own wake/slip", curves_of(results, "wake", "mesh_over_d", "wake_over_slip", reynolds=slow, undisturbed=0)))
+        slow, fast = min(results["wake_reynolds"]), max(results["wake_reynolds"])
+        panels = [(f"Re = {reynolds:.2g}: error" + (", wake accounted for" if undisturbed else ""), curves_of(results, "wake", "mesh_over_d", "error", reynolds=reynolds, undisturbed=undisturbed))
+                  for reynolds in sorted({slow, fast}) for undisturbed in (0, 1)]
+        panels.insert(0, (f"Re = {slow:.2g}: own wake/slip", curves_of(results, "wake", "mesh_over_d", "wake_over_slip", reynolds=slow, undisturbed=0)))
         study.plot_lines(folder / "wake.png", "element length/d", "[-]", panels)
     if "beds_error" in results:
         study.plot_lines(folder / "beds.png", "element length/d", "|error| of the gradient [-]", [("jittered lattice, held", curves_of(results, "beds", "mesh_over_d", "error"))])

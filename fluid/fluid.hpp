@@ -41,7 +41,7 @@ struct Report {
   double change = 0.0;           // of the last Newton iteration
   double net_inflow = 0.0;       // through all boundaries relative to the mesh [m^dim/s]
   double pore_volume_rate = 0.0; // d/dt of int eps over the domain [m^dim/s]
-  double volume_error = 0.0;     // of their balance, relative to the fastest flow through all of the boundary and all changes of eps [-]
+  double volume_error = 0.0;     // of their balance, less 1e-14 of the volume, relative to the fastest flow through all of the boundary and all changes of eps [-]
   // The largest of any element: of the flow relative to the mesh, at its middle, h the length of the element along it.
   double courant = 0.0;          // |u - w| dt/h [-]; 0 where the flow is steady
   double peclet = 0.0;           // rho |u - w| h/eta [-]
