@@ -260,7 +260,7 @@ void Coupling<dim>::set_reaction(double dt) {
   for (std::size_t i = 0; i < x_.size(); ++i) {
     const Answer& answer = answer_[i];
     Values values = zero;
-    values.template head<3 * dim + 2>() << answer.beta, answer.yield, answer.beta * (answer.v + drag_[i].shift - u_before_[i]), answer.given + answer.yield * answer.grad_p + carry_[i] / dt, Vec<dim>::Zero();
+    values.template head<3 * dim + 2>() << answer.beta, answer.yield, answer.beta * (answer.v + drag_[i].shift - u_before_[i]), answer.given + answer.yield * (answer.grad_p - grad_p_before_[i]) + carry_[i] / dt, Vec<dim>::Zero();
     for (int axis = 0; axis < dim; ++axis)
       if (!(held_[i] >> axis & 1)) values[2 + 2 * dim + axis] = solid_volume_of(static_cast<int>(i));
     kernel_.give(static_cast<int>(i), values, to_carriers);
@@ -317,7 +317,7 @@ Report<dim> Coupling<dim>::step(double dt) {
   tell_grains();
   expect_drag(dt);
   answer_as_expected(dt);
-  u_before_ = u_, u_mean_before_ = u_mean_;
+  u_before_ = u_, u_mean_before_ = u_mean_, grad_p_before_ = grad_p_;
   const bool again = settings.fluid_moves && settings.grains_move && std::isfinite(settings.tolerance);
   if (again) fluid_.mark();
   const std::vector<char> grains_before = again ? grains_.state() : std::vector<char>{};

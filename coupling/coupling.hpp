@@ -21,7 +21,8 @@
 // kernel along with a grain that differs from it by shear: a viscosity of beta r_0^2, in dense beds hundreds of times the fluid's. (The mean over the
 // kernel in the place of u_i has no such viscosity, but the flow must then be what, averaged, is as the grains are: along walls it overshoots.) So
 // beta takes the change of u over the step only (Fluid::reaction_on_change), the rest is as it was: the Fourier transform of K is between 0 and 1,
-// this is a contraction, however large beta dt is.
+// this is a contraction, however large beta dt is. So does c V the change of grad p, which grains feel averaged and elements have as it is: a bed that
+// is let go keeps the flow that it had when it was held.
 #pragma once
 
 #include "drag.hpp"
@@ -138,7 +139,7 @@ class Coupling {
   std::vector<Vec<dim>> target_;   // u - shift, as the grains were told
   Vec<dim> grains_error_;          // of their balance of momentum [N s]
   std::vector<Vec<dim>> u_, u_mean_, grad_p_;      // where the grain is; mean over its kernel
-  std::vector<Vec<dim>> u_before_, u_mean_before_;  // the fluid's step
+  std::vector<Vec<dim>> u_before_, u_mean_before_, grad_p_before_;  // the fluid's step
   std::vector<double> r_, m_, eps_at_;
   std::vector<Place<dim>> place_;
   std::vector<char> free_;         // bore no contact in the last step

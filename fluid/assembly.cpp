@@ -25,6 +25,7 @@ ElementInput<dim, order> Fluid<dim>::input(int element) const {
   for (int a = 0; a <= dim; ++a) {
     const int k = mesh_->elements[element][a];
     in.x[a] = position_[k], in.mesh_velocity[a] = mesh_velocity_[k];
+    in.pressure[a] = x_[0][space_.pressure_dof(space_.vertex[k])];
   }
   for (int a = 0; a < in.n; ++a) {
     const int node = space_.node_of[element * in.n + a];
@@ -143,11 +144,14 @@ void Fluid<dim>::add_boundaries() {
         Vec<dim> flux = Vec<dim>::Zero(), grad_eps = Vec<dim>::Zero(), mesh_velocity = Vec<dim>::Zero();
         for (int a = 0; a < n; ++a) eps += shape[a] * in.eps[0][a], flux += shape[a] * in.flux[0][a], grad_eps += in.eps[0][a] * grad[a];
         for (int a = 0; a <= dim; ++a) mesh_velocity += l[a] * in.mesh_velocity[a];
+        // Of a reaction on change, what was given before.
+        double before = 0.0;
+        if (reaction_on_change) before = yield * (outer_before_[k][q] - pressure_in(facet.element, l));
         const double enters = in.advection ? properties.density * std::max(-(flux - eps * mesh_velocity).dot(area), 0.0) : 0.0;
         for (int a = 0; a < n; ++a)
           for (int i = 0; i < dim; ++i) {
             const int row = dof_of<dim>(a) + i;
-            system.b[row] += shape[a] * (enters * outer_velocity_[k][q][i] - (eps + yield) * outer_pressure_[k][q] * area[i]);
+            system.b[row] += shape[a] * (enters * outer_velocity_[k][q][i] - ((eps + yield) * outer_pressure_[k][q] - before) * area[i]);
             for (int b = 0; b <= dim; ++b) system.a(row, dof_of<dim>(b) + dim) -= shape[a] * (eps + yield) * l[b] * area[i];
             for (int b = 0; b < n; ++b) {
               system.a(row, dof_of<dim>(b) + i) += enters * shape[a] * shape[b] / eps;

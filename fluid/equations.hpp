@@ -50,6 +50,7 @@ struct ElementInput {
   std::array<Vec<dim>, order == 1 ? n : 0> eps_slope;  // grad eps now, at the nodes: the mean of the elements around [1/m]
   std::array<Vec<dim>, dim + 1> mesh_velocity;     // [m/s]
   const Reaction<dim>* reaction = nullptr;         // at each quadrature point, or none
+  std::array<double, dim + 1> pressure;            // one step ago [Pa]
   std::array<const Vec<dim>*, 2> subscale{};       // order 1: one and two steps ago, at each quadrature point [m/s]; none: 0
   bool reaction_on_change = false;                 // see Fluid
   const Vec<dim>* advance = nullptr;               // of the solid's flux before, at each quadrature point [m/s]: see Fluid::grains_follow
@@ -142,7 +143,10 @@ struct AtPoint {
     eps = eps_at[0];
     drives = eps + reaction.yield, follows = reaction.follows;
     past_velocity = flux[1] / eps_at[1];
-    if (in.reaction_on_change) reaction.beta_target += reaction.beta * past_velocity;
+    if (in.reaction_on_change) {
+      reaction.beta_target += reaction.beta * past_velocity;
+      for (int a = 0; a <= dim; ++a) reaction.force += reaction.yield * in.pressure[a] * g.grad_l[a];
+    }
     eps_rate = rate(time, eps_at[0] - eps_at[1], eps_at[1] - eps_at[2]) - mesh_velocity.dot(grad_eps);
     const double inv_eps = 1.0 / eps;
     relative = in.advection ? Vec<dim>(flux[0] * inv_eps - mesh_velocity) : Vec<dim>::Zero();

@@ -298,7 +298,10 @@ std::vector<Vec<dim>> Fluid<dim>::advances(const std::vector<double>& x, double 
 template <int dim>
 std::vector<double> Fluid<dim>::solve_step(double t, const TimeWeights& time, Report& report) {
   hold(t);
+  outer_before_ = outer_pressure_;
   evaluate_outside(t);
+  for (std::size_t k = 0; k < conditions_.size(); ++k)
+    if (outer_before_[k].empty()) outer_before_[k] = outer_pressure_[k];
   std::vector<double> x = guess_;
   const bool newton = settings.advection == Advection::newton;
   for (int k = 0;; ++k) {
@@ -360,12 +363,12 @@ void Fluid<dim>::set_parts(std::span<const double> parts) {
 
 template <int dim>
 void Fluid<dim>::mark() {
-  marked_ = parts(), marked_move_ = moved_for_;
+  marked_ = parts(), marked_move_ = moved_for_, marked_outside_ = outer_pressure_;
 }
 
 template <int dim>
 void Fluid<dim>::back() {
-  set_parts(marked_), moved_for_ = marked_move_;
+  set_parts(marked_), moved_for_ = marked_move_, outer_pressure_ = marked_outside_;
 }
 
 template <int dim>

@@ -85,7 +85,8 @@ class Fluid {
   void set_reaction(std::vector<Reaction<dim>> reaction);
   std::vector<Vec<dim>> quadrature_points() const;
   std::vector<double> quadrature_weights() const;  // they add up to the volume [m^dim]
-  // The reaction is beta (target - (u - u before)) + force: what beta stands for is then no more than the change of a force that is told otherwise.
+  // The reaction is beta (target - (u - u before)) + force - yield (grad p - grad p before): what beta and yield stand for is then no more than the
+  // change of a force that is told otherwise.
   bool reaction_on_change = false;
   // The grains' void fraction is that of the start of a step: d(eps)/dt lags behind by one, and where grains follow the fluid, u ~ v, a column
   // of more than half solids would answer every step with a larger one, u = -(1 - eps)/eps v. With this set, continuity takes the change of the
@@ -192,7 +193,7 @@ class Fluid {
   template <class Use>
   void each_point(Use&& use) const;
   template <class Use>
-  void each_open_point(Use&& use) const;
+  void each_open_point(Use&& use, int steps_ago = 0) const;
   double yield_at(const std::array<int, dim + 1>& corners, const Barycentric<dim>& l) const;
   template <int order>
   void scatter(int local, const ElementSystem<dim, order>& system);
@@ -212,8 +213,8 @@ class Fluid {
     double eps;
   };
   InElement flow_in(int element, const Barycentric<dim>& l, const Geometry<dim>& g) const;
-  double pressure_in(int element, const Barycentric<dim>& l) const;
-  Vec<dim> pressure_slope(int element, const Geometry<dim>& g) const;
+  double pressure_in(int element, const Barycentric<dim>& l, int steps_ago = 0) const;
+  Vec<dim> pressure_slope(int element, const Geometry<dim>& g, int steps_ago = 0) const;
   Vec<dim> mesh_velocity_at(int node) const;
   std::vector<std::pair<int, Vec<dim>>> facet_nodes(int facet) const;
   void spread_surplus(const char* function, const std::vector<double>& x, const TimeWeights& time, std::vector<double>& missing) const;
@@ -236,6 +237,7 @@ class Fluid {
   std::vector<Vec<dim>> mesh_velocity_, old_mesh_velocity_;  // of mesh nodes
   std::vector<double> marked_;                     // by mark(), with the next
   double marked_move_ = 0.0;
+  std::vector<std::vector<double>> marked_outside_;
   double moved_for_ = 0.0;                         // length of the coming step where move() was called, else 0 [s]
   std::array<std::vector<double>, 3> eps_;         // at velocity nodes: now, one and two steps ago
   std::array<std::vector<double>, 2> x_;           // unknowns, Cartesian, after the last step and the one before
@@ -251,7 +253,7 @@ class Fluid {
   std::vector<double> yield_;                      // of the reaction at mesh nodes; empty: 0
   std::vector<Held> held_;
   std::vector<char> has_frame_;
-  std::vector<std::vector<double>> outer_pressure_;  // per boundary, at the facets' quadrature points
+  std::vector<std::vector<double>> outer_pressure_, outer_before_;  // per boundary, at the facets' quadrature points; that of the step before
   std::vector<std::vector<Vec<dim>>> outer_velocity_;
   std::vector<std::vector<int>> facets_of_;          // of each boundary
   std::vector<double> values_, b_;                   // this rank's rows, before conditions

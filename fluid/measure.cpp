@@ -160,16 +160,16 @@ Vec<dim> Fluid<dim>::velocity_in(int element, const Barycentric<dim>& l, int ste
 }
 
 template <int dim>
-double Fluid<dim>::pressure_in(int element, const Barycentric<dim>& l) const {
+double Fluid<dim>::pressure_in(int element, const Barycentric<dim>& l, int steps_ago) const {
   double p = 0.0;
-  for (int a = 0; a <= dim; ++a) p += l[a] * x_[0][space_.pressure_dof(space_.vertex[mesh_->elements[element][a]])];
+  for (int a = 0; a <= dim; ++a) p += l[a] * x_[steps_ago][space_.pressure_dof(space_.vertex[mesh_->elements[element][a]])];
   return p;
 }
 
 template <int dim>
-Vec<dim> Fluid<dim>::pressure_slope(int element, const Geometry<dim>& g) const {
+Vec<dim> Fluid<dim>::pressure_slope(int element, const Geometry<dim>& g, int steps_ago) const {
   Vec<dim> slope = Vec<dim>::Zero();
-  for (int a = 0; a <= dim; ++a) slope += x_[0][space_.pressure_dof(space_.vertex[mesh_->elements[element][a]])] * g.grad_l[a];
+  for (int a = 0; a <= dim; ++a) slope += x_[steps_ago][space_.pressure_dof(space_.vertex[mesh_->elements[element][a]])] * g.grad_l[a];
   return slope;
 }
 
@@ -190,14 +190,15 @@ auto Fluid<dim>::probe(std::span<const Vec<dim>> x) const -> std::vector<Probe> 
 // Calls use(facet, point in its element, area times normal, p_out - p) where the pressure outside is given.
 template <int dim>
 template <class Use>
-void Fluid<dim>::each_open_point(Use&& use) const {
+void Fluid<dim>::each_open_point(Use&& use, int steps_ago) const {
+  const auto& outside = steps_ago == 0 ? outer_pressure_ : outer_before_;
   for (std::size_t k = 0; k < conditions_.size(); ++k) {
-    if (!conditions_[k].pressure || outer_pressure_[k].empty()) continue;  // before the first step nothing is known
+    if (!conditions_[k].pressure || outside[k].empty()) continue;  // before the first step nothing is known
     std::size_t q = 0;
     for (const int f : facets_of_[k]) {
       const FacetView<dim> facet(*mesh_, position_, f);
       along<dim>(facet, [&](const Barycentric<dim>& l, double weight) {
-        use(facet, l, Vec<dim>(weight * facet.area), outer_pressure_[k][q++] - pressure_in(facet.element, l));
+        use(facet, l, Vec<dim>(weight * facet.area), outside[k][q++] - pressure_in(facet.element, l, steps_ago));
       });
     }
   }
@@ -292,7 +293,8 @@ Vec<dim> Fluid<dim>::reaction_force() const {
     const auto& rule = quadrature<dim, order>();
     for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
       const Geometry<dim> g = geometry<dim>(position_, mesh_->elements[e]);
-      const Vec<dim> grad_p = pressure_slope(static_cast<int>(e), g);
+      Vec<dim> grad_p = pressure_slope(static_cast<int>(e), g);
+      if (reaction_on_change) grad_p -= pressure_slope(static_cast<int>(e), g, 1);
       for (std::size_t q = 0; q < rule.size(); ++q) {
         const Reaction<dim>& r = reaction_[e * rule.size() + q];
         Vec<dim> u = velocity_in(static_cast<int>(e), rule[q].l);
@@ -301,9 +303,10 @@ Vec<dim> Fluid<dim>::reaction_force() const {
       }
     }
   });
-  each_open_point([&](const FacetView<dim>& facet, const Barycentric<dim>& l, const Vec<dim>& area, double step) {
-    sum -= yield_at(mesh_->elements[facet.element], l) * step * area;
-  });
+  for (int ago = 0; ago <= reaction_on_change; ++ago)
+    each_open_point([&](const FacetView<dim>& facet, const Barycentric<dim>& l, const Vec<dim>& area, double step) {
+      sum += (ago == 0 ? -1 : 1) * yield_at(mesh_->elements[facet.element], l) * step * area;
+    }, ago);
   return sum;
 }
 
