@@ -570,7 +570,7 @@ def test_a_bed_of_light_grains_rises_without_swinging(ratio, k):
     assert -1e-4 < speeds.min() and speeds.max() < 0.05  # twice what it settles at
     if k < 2:  # else it is at the top by then
         rates = np.diff(speeds)[4:]  # the first answer is that of grains held, and given back in the second
-        assert np.abs(rates).max() < 1.1 * rates[0] and speeds[-1] > 10 * np.abs(rates[-1])
+        assert np.abs(rates).sum() - np.abs(rates.sum()) < 0.02 * speeds[-1]  # to and fro
     largest = 0.0
     for report in reports:
         largest = max(largest, report.exchanged_impulse)
