@@ -29,6 +29,7 @@ template <int dim>
 Coupling<dim>::Coupling(Simulation<dim>& grains, fluid::Fluid<dim>& fluid, Settings the_settings)
     : settings(std::move(the_settings)), grains_(grains), fluid_(fluid), mesh_(fluid.space().mesh), walker_(mesh_, grains.box().period),
       kernel_(mesh_, settings.kernel, settings.kernel_radius, grains.box().period), outlet_(mesh_->boundary_names.size(), false) {
+  if (!(settings.added_mass >= 0 && std::isfinite(settings.added_mass))) fail("Coupling: added_mass must be >= 0 and finite, got {}", settings.added_mass);
   const Vec<dim>& period = grains.box().period;
   Vec<dim> low = mesh_->nodes[0], high = low, shift = Vec<dim>::Zero();
   for (const Vec<dim>& x : mesh_->nodes) low = low.cwiseMin(x), high = high.cwiseMax(x);
@@ -218,10 +219,10 @@ void Coupling<dim>::expect_drag(double dt) {
     std::vector<int> again;
     for (const int i : which) {
       if (!free_[i] || !settings.grains_move) continue;
-      const double k = dt * drag_[i].gamma / m_[i], left = left_of(k);
-      const Vec<dim> rest = m_[i] * grains_.gravity + stress_force_[i];
+      const double mass = m_[i] + added_mass_of(i), k = dt * drag_[i].gamma / mass, left = left_of(k);
+      const Vec<dim> rest = m_[i] * grains_.gravity + stress_force_[i] + added_mass_of(i) * convection_[i];
       // Without drag it would fall freely; with it, it tends to u - shift + rest/gamma.
-      const Vec<dim> end = k > 1e-8 ? Vec<dim>(u_[i] - drag_[i].shift + rest / drag_[i].gamma) : Vec<dim>(v_[i] + dt / m_[i] * rest);
+      const Vec<dim> end = k > 1e-8 ? Vec<dim>(u_[i] - drag_[i].shift + rest / drag_[i].gamma) : Vec<dim>(v_[i] + dt / mass * rest);
       const Vec<dim> next = u_[i] - (k > 1e-8 ? Vec<dim>(end + left * (v_[i] - end)) : end);
       const double before = slip[i].norm(), after = next.norm();
       if (after > 2 * before || growth[i] * std::abs(after - before) > 0.03 * before) again.push_back(i);
@@ -234,11 +235,13 @@ void Coupling<dim>::expect_drag(double dt) {
 template <int dim>
 void Coupling<dim>::answer_as_expected(double dt) {
   for (std::size_t i = 0; i < x_.size(); ++i) {
-    const double gamma = drag_[i].gamma, c = settings.grains_move ? share_of(dt * gamma / m_[i]) : 0.0;
-    answer_[i] = {gamma, started_ ? c * solid_volume_of(static_cast<int>(i)) : 0.0, settings.grains_move ? v_[i] : Vec<dim>(Vec<dim>::Zero()), Vec<dim>::Zero(), grad_p_[i]};
+    const double gamma = drag_[i].gamma, added = added_mass_of(static_cast<int>(i)), mass = m_[i] + added;
+    double c = settings.grains_move ? share_of(dt * gamma / mass) : 0.0;
+    if (settings.grains_move) c += added / mass * (1 - c);
+    answer_[i] = {gamma, started_ ? c * solid_volume_of(static_cast<int>(i)) : 0.0, settings.grains_move ? v_[i] : Vec<dim>(Vec<dim>::Zero()), -added * convection_[i], grad_p_[i], added / dt};
     if (!free_[i] || !settings.grains_move) continue;
-    answer_[i].beta = (1 - c) * gamma;
-    answer_[i].given = c * (m_[i] * grains_.gravity + stress_force_[i]);
+    answer_[i].beta = (1 - c) * gamma, answer_[i].inertia *= 1 - c;
+    answer_[i].given = c * (m_[i] * grains_.gravity + stress_force_[i]) + (1 - c) * answer_[i].given;
   }
 }
 
@@ -246,9 +249,17 @@ void Coupling<dim>::answer_as_expected(double dt) {
 template <int dim>
 void Coupling<dim>::answer_as_last(double dt) {
   for (std::size_t i = 0; i < x_.size(); ++i) {
-    if (free_[i] || drag_[i].gamma == 0) continue;
-    answer_[i].beta = drag_[i].gamma, answer_[i].given.setZero();
-    answer_[i].v = target_[i] - drag_force_[i] / (dt * drag_[i].gamma), answer_[i].grad_p = grad_p_[i];
+    if (free_[i]) continue;
+    Vec<dim> drag = drag_force_[i];
+    if (settings.added_mass > 0) {
+      drag -= added_impulse_[i];
+      answer_[i].inertia = added_mass_of(static_cast<int>(i)) / dt;
+      answer_[i].given = answer_[i].inertia * (u_mean_[i] - u_mean_before_[i]) - added_impulse_[i] / dt, answer_[i].grad_p = grad_p_[i];
+    }
+    if (drag_[i].gamma == 0) continue;
+    answer_[i].beta = drag_[i].gamma, answer_[i].grad_p = grad_p_[i];
+    if (settings.added_mass == 0) answer_[i].given.setZero();
+    answer_[i].v = target_[i] - drag / (dt * drag_[i].gamma);
   }
 }
 
@@ -272,6 +283,12 @@ void Coupling<dim>::set_reaction(double dt) {
     at_nodes[k].beta = density[0], at_nodes[k].yield = density[1];
     at_nodes[k].beta_target = density.template segment<dim>(2), at_nodes[k].force = density.template segment<dim>(2 + dim);
     at_nodes[k].follows = density.template segment<dim>(2 + 2 * dim);
+  }
+  if (settings.added_mass > 0) {  // by itself: the sums above are of whole registers
+    std::vector<double> inertia(kernel_.carriers(), 0.0);
+    for (std::size_t i = 0; i < x_.size(); ++i) kernel_.give(static_cast<int>(i), answer_[i].inertia, inertia);
+    inertia = kernel_.to_nodes(inertia, 0.0);
+    for (std::size_t k = 0; k < inertia.size(); ++k) at_nodes[k].inertia = inertia[k] / kernel_.masses()[k];
   }
   fluid_.set_reaction(std::move(at_nodes));
 }
@@ -313,8 +330,13 @@ Report<dim> Coupling<dim>::step(double dt) {
     eps_ = fluid_.void_fraction();
     eps_.resize(mesh_->nodes.size());
   }
-  flow_ = fluid_.projected();  // on the mesh as it is now
+  flow_ = fluid_.projected(settings.added_mass > 0);  // on the mesh as it is now
   tell_grains();
+  convection_.assign(n, Vec<dim>::Zero());
+  if (settings.added_mass > 0) {
+    const auto at_carriers = kernel_.to_carriers(flow_.convection, Vec<dim>(Vec<dim>::Zero()));
+    for (int i = 0; i < n; ++i) convection_[i] = kernel_.at_grain(i, at_carriers);
+  }
   expect_drag(dt);
   answer_as_expected(dt);
   u_before_ = u_, u_mean_before_ = u_mean_, grad_p_before_ = grad_p_;
@@ -344,7 +366,7 @@ Report<dim> Coupling<dim>::step(double dt) {
       if (!settings.fluid_moves) continue;
       const Answer& answer = answer_[i];
       const Vec<dim> u = u_before_[i] + u_mean_[i] - u_mean_before_[i];  // as its equations have it
-      const Vec<dim> gave = dt * (answer.beta * (u - drag_[i].shift - answer.v) - answer.given + answer.yield * (grad_p_[i] - answer.grad_p));
+      const Vec<dim> gave = dt * (answer.beta * (u - drag_[i].shift - answer.v) - answer.given + answer.yield * (grad_p_[i] - answer.grad_p) + answer.inertia * (u_mean_[i] - u_mean_before_[i]));
       next_carry[i] = gave - drag_force_[i];
       given += gave, carried += next_carry[i], apart += next_carry[i].norm();
     }
@@ -368,7 +390,7 @@ Report<dim> Coupling<dim>::step(double dt) {
   return report;
 }
 
-// The grains' step in the flow as it is; drag_force_ is then drag's impulse.
+// The grains' step in the flow as it is; drag_force_ is then the impulse of drag and added mass.
 template <int dim>
 void Coupling<dim>::move_grains(double dt, Report<dim>& report) {
   const int n = static_cast<int>(x_.size());
@@ -376,13 +398,23 @@ void Coupling<dim>::move_grains(double dt, Report<dim>& report) {
   target_.resize(n), drag_force_.resize(n);
   for (int i = 0; i < n; ++i) gamma[i] = drag_[i].gamma, target_[i] = u_[i] - drag_[i].shift;
   grains_error_.setZero();
+  std::vector<double> added;
+  added_impulse_.clear();
+  if (settings.added_mass > 0)
+    for (int i = 0; i < n; ++i) {
+      added.push_back(added_mass_of(i));
+      added_impulse_.push_back(added[i] * (u_mean_[i] - u_mean_before_[i] + dt * convection_[i]));  // of a grain at rest
+    }
   if (!settings.grains_move) {
     for (int i = 0; i < n; ++i) drag_force_[i] = dt * gamma[i] * target_[i];
+    for (std::size_t i = 0; i < added.size(); ++i) drag_force_[i] += added_impulse_[i];
     return;
   }
   const double stepping = seconds();
-  grains_.set_force(stress_force_);
-  grains_.set_drag(gamma, target_);
+  std::vector<Vec<dim>> force = stress_force_;
+  for (std::size_t i = 0; i < added.size(); ++i) force[i] += added_impulse_[i] / dt;
+  grains_.set_force(force);
+  grains_.set_drag(gamma, target_, added);
   for (auto& [boundary, follow] : follows_) follow->from = grains_.walls()[follow->wall].point;
   report.grains = grains_.step(dt);
   report.grains_time += seconds() - stepping;
@@ -392,6 +424,7 @@ void Coupling<dim>::move_grains(double dt, Report<dim>& report) {
   const auto& in_contact = grains_.in_contact();
   const auto& contact_impulse = grains_.contact_impulse();
   const auto after = grains_.by_id([](const Grains<dim>& g, int k) { return Vec<dim>(g.body[k].v); });
+  for (std::size_t i = 0; i < added.size(); ++i) drag_force_[i] += added_impulse_[i], added_impulse_[i] -= added[i] * (after[i] - v_[i]);
   for (int i = 0; i < n; ++i) {
     free_[i] = !in_contact[i];
     grains_error_ += m_[i] * (after[i] - v_[i]) - dt * (m_[i] * grains_.gravity + stress_force_[i]) - drag_force_[i] - contact_impulse[i];

@@ -23,6 +23,12 @@
 // beta takes the change of u over the step only (Fluid::reaction_on_change), the rest is as it was: the Fourier transform of K is between 0 and 1,
 // this is a contraction, however large beta dt is. So does c V the change of grad p, which grains feel averaged and elements have as it is: a bed that
 // is let go keeps the flow that it had when it was held.
+// Added mass m_a (Du/Dt - dv/dt), m_a = C_m rho V: T. R. Auton, J. C. R. Hunt and M. Prud'homme, J. Fluid Mech. 197 (1988), M. R. Maxey and J. J. Riley, Phys.
+// Fluids 26 (1983). Du/Dt is (u - u before)/dt + (u - w) . grad u of before, w the mesh's velocity, means over the kernel as grad p is: so the phases agree on it.
+// Grains are as heavy as M = m + m_a in their step, k = dt gamma/M, and with c of above and 1 - C = (1 - c) m/M, C in the place of c, J of both together is
+//   J/dt = (1 - C) (gamma (u - s - v_0) + m_a Du/Dt) - C R of free grains, gamma (u - s - v_0) + m_a Du/Dt + C V (grad p - grad p before) of others;
+// the fluid is heavier by what stands before u - u before. Of the mode above amplifications are then 1.00 at solids 0.3 and 1.08 at 0.6, for densities from
+// 0.001 times the fluid's; without it, where pressure binds the phases, 300 and 600 at 0.001 and 2.3 and 4.7 at 0.1. Explicit, it would have m_a/m.
 #pragma once
 
 #include "drag.hpp"
@@ -49,6 +55,7 @@ struct Settings {
   bool undisturbed = false;    // drag by the flow without the grain's own wake (wake.hpp), spheres only
   bool fluid_moves = true;     // false: it stays what it is, and feels no grain
   bool grains_move = true;     // false: a bed that is held
+  double added_mass = 0.0;     // C_m [-], 0.5 of a sphere by itself; 0: none
   double tolerance = std::numeric_limits<double>::infinity();  // of the phases' disagreement; above it another pass is made
   int max_passes = 20;
 };
@@ -59,7 +66,7 @@ struct Report {
   StepReport<dim> grains;
   fluid::Report fluid;
   int passes = 0;                           // of fluid and grains
-  Vec<dim> drag = Vec<dim>::Zero();         // on all grains, mean over dt [N] (2D: N/m)
+  Vec<dim> drag = Vec<dim>::Zero();         // and added mass, on all grains, mean over dt [N] (2D: N/m)
   double exchanged_impulse = 0.0;           // sum of |J_i| [N s]
   double carried_impulse = 0.0;             // |sum of carry_i| over it [-]
   double disagreement = 0.0;                // sum of |carry_i| over it [-]
@@ -89,7 +96,7 @@ class Coupling {
 
   int removed() const { return removed_; }
   // By id, of the last step.
-  const std::vector<Vec<dim>>& drag_force() const { return drag_force_; }        // mean over the step [N]
+  const std::vector<Vec<dim>>& drag_force() const { return drag_force_; }        // and of added mass, mean over the step [N]
   const std::vector<Vec<dim>>& stress_force() const { return stress_force_; }    // V (-grad p + div(2 eta D(u))) [N]
   const std::vector<Vec<dim>>& fluid_velocity() const { return u_; }             // u where each grain is [m/s]
   const std::vector<double>& void_fraction() const { return eps_at_; }
@@ -103,9 +110,10 @@ class Coupling {
     double gamma = 0.0;                    // [kg/s]
     Vec<dim> shift = Vec<dim>::Zero();     // [m/s]
   };
-  struct Answer {      // what the fluid takes J/dt to be: beta (u - shift - v) - given + yield (grad p - grad p known)
+  struct Answer {      // what the fluid takes J/dt to be: beta (u - shift - v) - given + yield (grad p - grad p known) + inertia (u - u before)
     double beta, yield;                    // [kg/s], [m^dim]
     Vec<dim> v, given, grad_p;             // [m/s], [N], [Pa/m]
+    double inertia;                        // [kg/s]
   };
 
   struct Own { double spread, solids; };  // s of wake.hpp [m]; of 1 - eps where the grain is, its part
@@ -123,6 +131,7 @@ class Coupling {
   void move_grains(double dt, Report<dim>& report);
   void tell_grains();
   double solid_volume_of(int i) const { return solid_volume<dim>(r_[i]); }
+  double added_mass_of(int i) const { return settings.added_mass * fluid_.properties.density * solid_volume_of(i); }
 
   Simulation<dim>& grains_;
   fluid::Fluid<dim>& fluid_;
@@ -140,6 +149,8 @@ class Coupling {
   Vec<dim> grains_error_;          // of their balance of momentum [N s]
   std::vector<Vec<dim>> u_, u_mean_, grad_p_;      // where the grain is; mean over its kernel
   std::vector<Vec<dim>> u_before_, u_mean_before_, grad_p_before_;  // the fluid's step
+  std::vector<Vec<dim>> convection_;               // the same time's (u - w) . grad u, mean over the kernel; 0 without added mass
+  std::vector<Vec<dim>> added_impulse_;            // of added mass in the last step [N s]; empty without
   std::vector<double> r_, m_, eps_at_;
   std::vector<Place<dim>> place_;
   std::vector<char> free_;         // bore no contact in the last step

@@ -61,9 +61,9 @@ void bind(py::module_& m, const char* suffix) {
       .def_readonly("dt", &R::dt, "[s]")
       .def_readonly("grains", &R::grains, "report of the grains' step")
       .def_readonly("fluid", &R::fluid, "report of the fluid's step")
-      .def_property_readonly("drag", [](const R& r) { return r.drag; }, "on all grains, mean over the step (dim,) [N] (2D: N/m)")
+      .def_property_readonly("drag", [](const R& r) { return r.drag; }, "and added mass on all grains, mean over the step (dim,) [N] (2D: N/m)")
       .def_readonly("passes", &R::passes, "of fluid and grains")
-      .def_readonly("exchanged_impulse", &R::exchanged_impulse, "sum over grains of |impulse of drag| [N s] (2D: N s/m)")
+      .def_readonly("exchanged_impulse", &R::exchanged_impulse, "sum over grains of |impulse of drag and added mass| [N s] (2D: N s/m)")
       .def_readonly("carried_impulse", &R::carried_impulse, "|impulse that the fluid gave less what the grains got|, handed to the fluid in the next step, over exchanged_impulse [-]")
       .def_readonly("disagreement", &R::disagreement, "the same summed grain by grain [-]")
       .def_readonly("momentum_error", &R::momentum_error, "of fluid, grains and carried impulse, less what boundaries and bodies gave, over exchanged_impulse [-]")
@@ -74,17 +74,17 @@ void bind(py::module_& m, const char* suffix) {
       .def_readonly("exchange_time", &R::exchange_time, "[s]");
   py::class_<C>(m, fmt::format("Coupling{}", suffix).c_str())
       .def(py::init([](Simulation<dim>& grains, fluid::Fluid<dim>& fluid, const std::string& kernel, double radius, const py::object& drag, const std::string& discs, bool undisturbed,
-                       bool fluid_moves, bool grains_move) {
+                       double added_mass, bool fluid_moves, bool grains_move) {
              coupling::Settings settings;
              settings.kernel = one_of("Coupling: kernel", kernel, kernels);
              settings.kernel_radius = radius;
              settings.drag = drag_law(drag);
              settings.discs = one_of("Coupling: discs", discs, kinds_of_discs);
-             settings.undisturbed = undisturbed && fluid_moves;
+             settings.undisturbed = undisturbed && fluid_moves, settings.added_mass = added_mass;
              settings.fluid_moves = fluid_moves, settings.grains_move = grains_move;
              return std::make_unique<C>(grains, fluid, std::move(settings));
            }),
-           py::keep_alive<1, 2>(), py::keep_alive<1, 3>(), "grains"_a, "fluid"_a, "kernel"_a, "kernel_radius"_a, "drag"_a, "discs"_a, "undisturbed"_a, "fluid_moves"_a, "grains_move"_a)
+           py::keep_alive<1, 2>(), py::keep_alive<1, 3>(), "grains"_a, "fluid"_a, "kernel"_a, "kernel_radius"_a, "drag"_a, "discs"_a, "undisturbed"_a, "added_mass"_a, "fluid_moves"_a, "grains_move"_a)
       .def("follow", [](C& c, const std::string& boundary, const py::object& wall) { c.follow(boundary, py::cast<int>(wall.attr("number"))); }, "boundary"_a, "wall"_a,
            "From now on a boundary of the mesh goes with a wall of the grains, along axes that are not periodic.")
       .def("outlet", &C::set_outlet, "boundary"_a, "Grains whose centre leaves the mesh by this boundary are removed from now on.")
@@ -109,7 +109,7 @@ void bind(py::module_& m, const char* suffix) {
                       c.settings.max_passes = passes;
                     })
       .def_property_readonly("removed", &C::removed, "grains that left through outlets so far")
-      .def_property_readonly("drag_force", [](const C& c) { return to_numpy(c.drag_force()); }, "on each grain, mean over the last step (n, dim) [N] (2D: N/m)")
+      .def_property_readonly("drag_force", [](const C& c) { return to_numpy(c.drag_force()); }, "and that of added mass on each grain, mean over the last step (n, dim) [N] (2D: N/m)")
       .def_property_readonly("stress_force", [](const C& c) { return to_numpy(c.stress_force()); }, "volume times (-grad p + div(2 eta D(u))) of each grain (n, dim) [N] (2D: N/m)")
       .def_property_readonly("fluid_velocity", [](const C& c) { return to_numpy(c.fluid_velocity()); }, "where each grain is (n, dim) [m/s]")
       .def_property_readonly("void_fraction", [](const C& c) { return to_numpy(c.void_fraction()); }, "where each grain is (n,)");

@@ -2,7 +2,8 @@
 //   d(eps)/dt + div U = 0,   U = eps u,
 //   rho eps (du/dt + (u - w) . grad u) = -eps grad p + eps div(2 eta D(u)) + eps rho g - beta (u - v) + f - y grad p,
 // u the velocity of the fluid, eps the void fraction, w the velocity of the mesh, beta (v - u) + f - y grad p the force of what else is there
-// [N/m^3]; y stands for grains that the pressure sets in motion (coupling.hpp).
+// [N/m^3]; y stands for grains that the pressure sets in motion (coupling.hpp). Fluid that goes along with grains, their added mass rho_a [kg/m^3], makes it
+// heavier over a step, by -rho_a/dt (u - u before).
 // Unknowns are U and p: their divergence and gradient stand alone, whatever eps does. eps is continuous and as smooth as U.
 // Momentum is tested with w as it stands, its viscous term integrated by parts: 2 eta D(u) : grad(eps w); the natural condition is that
 // the viscous traction vanishes. A pure function of values; fluid.cpp loops.
@@ -39,6 +40,7 @@ struct Reaction {
   Vec<dim> force = Vec<dim>::Zero();       // [N/m^3]
   double yield = 0.0;                      // y [-]
   Vec<dim> follows = Vec<dim>::Zero();     // solid fraction that goes along with the fluid, along each axis: see Fluid::grains_follow
+  double inertia = 0.0;                    // rho_a/dt [kg/(m^3 s)]
 };
 
 template <int dim, int order>
@@ -86,7 +88,8 @@ Mat<dim> metric(const Geometry<dim>& g) {
 // It lives on from step to step, after R. Codina, J. Principe, O. Guasch and S. Badia, CMAME 196 (2007). Were it made anew in every step, with the
 // time step in tau, another time step would be another divergence of U, and cost a pressure of rho tau/dt times the residual.
 // 1/tau without time after Shakib, Hughes and Johan, CMAME 89 (1991), with the metric of the element, so that stretched elements are judged by the
-// direction of the flow; `tau` below [m^3 s/kg] is 1/(rho a[0] + 1/tau).
+// direction of the flow; `tau` below [m^3 s/kg] is 1/(rho a[0] + 1/tau). Added mass counts with rho, not with beta: a steady flow knows
+// nothing of it.
 // And the bulk viscosity [Pa s], that of LSIC (order 1) or grad-div (order 2): it knows neither the time step nor beta: with them, it would lock the
 // flow as they grow. It acts as a pressure -bulk/eps (div U + d(eps)/dt) does, on div(eps w): so the pressure beyond a step of eps is right.
 // Where eps bends, viscous forces have the pressure jump by 2 eta [u'], where it curves, curve; what a continuous, linear pressure cannot follow is
@@ -98,12 +101,12 @@ struct Stabilisation {
   double tau, bulk;
 };
 template <int dim, int order>
-Stabilisation<dim> stabilisation(const Mat<dim>& m, const Properties<dim>& fluid, const Vec<dim>& u, double rate, double beta_over_eps, double eps_jump) {
+Stabilisation<dim> stabilisation(const Mat<dim>& m, const Properties<dim>& fluid, const Vec<dim>& u, double rate, double inertia_over_eps, double beta_over_eps, double eps_jump) {
   constexpr double growth = order == 1 ? 40.0 : dim == 2 ? 200.0 : 0.0;
   const double advective = fluid.density * fluid.density * u.dot(m * u);
   const double viscous = 9.0 * fluid.viscosity * fluid.viscosity * m.squaredNorm();
   const double steady = advective + viscous;
-  return {1.0 / (fluid.density * rate + std::sqrt(steady + beta_over_eps * beta_over_eps)), (1.0 + growth * eps_jump * eps_jump) * std::sqrt(steady) / m.trace()};
+  return {1.0 / (fluid.density * rate + (std::sqrt(steady + beta_over_eps * beta_over_eps) + inertia_over_eps)), (1.0 + growth * eps_jump * eps_jump) * std::sqrt(steady) / m.trace()};
 }
 
 // All that a quadrature point knows before U and p are found.
@@ -154,14 +157,16 @@ struct AtPoint {
     for (int a = 0; a < n; ++a) {
       grad_u[a] = (grad[a] - shape[a] * inv_eps * grad_eps) * inv_eps;
       slope += in.flux[0][a] * grad_u[a].transpose();
-      inertia[a] = rho * (time[0] * shape[a] + eps * relative.dot(grad_u[a])) + reaction.beta * inv_eps * shape[a];
+      inertia[a] = rho * (time[0] * shape[a] + eps * relative.dot(grad_u[a])) + (reaction.beta + reaction.inertia) * inv_eps * shape[a];
     }
     const Vec<dim> past = time[1] * past_velocity + time[2] / eps_at[2] * flux[2];  // of du/dt
     load = eps * rho * (fluid.gravity - past) + reaction.beta_target + reaction.force;
+    if (reaction.inertia > 0) load += reaction.inertia * past_velocity;
     if (in.newton) load += rho * slope * flux[0];
     beside.setZero();
     for (int t = 0; t < 2; ++t)
       if (in.subscale[t]) beside += rho * time[t + 1] * in.subscale[t][q];
+    if (in.subscale[0] && reaction.inertia > 0) beside -= reaction.inertia * inv_eps * in.subscale[0][q];
     const Mat<dim> m = metric<dim>(g);
     eps_curvature.setZero();
     if constexpr (order == 1) {
@@ -175,7 +180,7 @@ struct AtPoint {
       beside -= fluid.viscosity * (eps_curvature * grains + eps_curvature.trace() * grains);
     }
     const auto [least, most] = std::minmax_element(in.eps[0].begin(), in.eps[0].end());
-    stab = stabilisation<dim, order>(m, fluid, relative, time[0], reaction.beta * inv_eps, (*most - *least) * inv_eps);
+    stab = stabilisation<dim, order>(m, fluid, relative, time[0], reaction.inertia * inv_eps, reaction.beta * inv_eps, (*most - *least) * inv_eps);
   }
 
   // What the viscous force -eps div(2 eta D(u)) is per unit of unknown b, column j by U_j: second derivatives of U/eps, U linear. Those of eps count as much

@@ -155,8 +155,8 @@ void Fluid<dim>::set_reaction(std::vector<Reaction<dim>> reaction) {
   if (!reaction.empty() && reaction.size() != points && reaction.size() != mesh_->nodes.size())
     fail("set_reaction: must have one value for each of {} quadrature points, or of {} nodes of the mesh, got {}", points, mesh_->nodes.size(), reaction.size());
   for (std::size_t k = 0; k < reaction.size(); ++k)
-    if (!(reaction[k].beta >= 0 && std::isfinite(reaction[k].beta)) || !reaction[k].beta_target.allFinite() || !reaction[k].force.allFinite() || !(reaction[k].yield >= 0))
-      fail("set_reaction: beta must be >= 0 kg/(m^3 s), target and force finite, yield >= 0, got beta = {}, yield = {} at point {}", reaction[k].beta, reaction[k].yield, k);
+    if (!(reaction[k].beta >= 0 && std::isfinite(reaction[k].beta)) || !reaction[k].beta_target.allFinite() || !reaction[k].force.allFinite() || !(reaction[k].yield >= 0) || !(reaction[k].inertia >= 0))
+      fail("set_reaction: beta must be >= 0 kg/(m^3 s), target and force finite, yield and inertia >= 0, got beta = {}, yield = {}, inertia = {} at point {}", reaction[k].beta, reaction[k].yield, reaction[k].inertia, k);
   yield_.clear();
   if (reaction.size() != mesh_->nodes.size()) {
     reaction_ = std::move(reaction);
@@ -172,7 +172,7 @@ void Fluid<dim>::set_reaction(std::vector<Reaction<dim>> reaction) {
           const Reaction<dim>& at_node = reaction[element[a]];
           sum.beta += point.l[a] * at_node.beta, sum.yield += point.l[a] * at_node.yield;
           sum.beta_target += point.l[a] * at_node.beta_target, sum.force += point.l[a] * at_node.force;
-          sum.follows += point.l[a] * at_node.follows;
+          sum.follows += point.l[a] * at_node.follows, sum.inertia += point.l[a] * at_node.inertia;
         }
       }
   });

@@ -140,8 +140,9 @@ class Fluid {
     std::vector<Vec<dim>> velocity;           // u [m/s]
     std::vector<Vec<dim>> pressure_gradient;  // [Pa/m], with the step to the pressure outside where that is given
     std::vector<Vec<dim>> viscous_force;      // div(2 eta D(u)), the traction at the boundary included [N/m^3]
+    std::vector<Vec<dim>> convection;         // (u - w) . grad u, w the velocity of the mesh [m/s^2]; empty where it was not asked for
   };
-  Projected projected() const;
+  Projected projected(bool convection = false) const;
   // Of the last step: what its equations leave open, summed over all that is not held; and the force of the reaction on the fluid [N] (2D: N/m).
   Vec<dim> momentum_residual() const;
   Vec<dim> reaction_force() const;
@@ -211,6 +212,7 @@ class Fluid {
     Vec<dim> u;        // [m/s]
     Mat<dim> stress;   // 2 eta D(u) [Pa]
     double eps;
+    Mat<dim> slope;    // d u_i/d x_j [1/s]
   };
   InElement flow_in(int element, const Barycentric<dim>& l, const Geometry<dim>& g) const;
   double pressure_in(int element, const Barycentric<dim>& l, int steps_ago = 0) const;

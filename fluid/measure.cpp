@@ -228,13 +228,13 @@ auto Fluid<dim>::flow_in(int element, const Barycentric<dim>& l, const Geometry<
   });
   const Vec<dim> u = flux / eps;
   slope = (slope - u * grad_eps.transpose()) / eps;
-  return {u, properties.viscosity * (slope + slope.transpose()), eps};
+  return {u, properties.viscosity * (slope + slope.transpose()), eps, slope};
 }
 
 template <int dim>
-auto Fluid<dim>::projected() const -> Projected {
+auto Fluid<dim>::projected(bool convection) const -> Projected {
   const std::vector<Vec<dim>> none(space_.nodes(), Vec<dim>::Zero());
-  Projected sum{none, none, none};
+  Projected sum{none, none, none, convection ? none : std::vector<Vec<dim>>{}};
   with_order(velocity_order(), [&]<int order>(std::integral_constant<int, order>) {
     for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
       const auto& corners = mesh_->elements[e];
@@ -249,6 +249,10 @@ auto Fluid<dim>::projected() const -> Projected {
           sum.pressure_gradient[node] += weight * point.l[a] * grad_p;
           sum.viscous_force[node] -= weight * there.stress * g.grad_l[a];
         }
+        if (!convection) continue;
+        Vec<dim> relative = there.u;
+        for (int a = 0; a <= dim; ++a) relative -= point.l[a] * mesh_velocity_[corners[a]];
+        for (int a = 0; a <= dim; ++a) sum.convection[space_.vertex[corners[a]]] += weight * point.l[a] * there.slope * relative;
       }
     }
     for (std::size_t f = 0; f < mesh_->facets.size(); ++f) {
@@ -269,6 +273,7 @@ auto Fluid<dim>::projected() const -> Projected {
     at_nodes.velocity.push_back(sum.velocity[node] / volumes[node]);
     at_nodes.pressure_gradient.push_back(sum.pressure_gradient[node] / volumes[node]);
     at_nodes.viscous_force.push_back(sum.viscous_force[node] / volumes[node]);
+    if (convection) at_nodes.convection.push_back(sum.convection[node] / volumes[node]);
   }
   return at_nodes;
 }
@@ -297,9 +302,8 @@ Vec<dim> Fluid<dim>::reaction_force() const {
       if (reaction_on_change) grad_p -= pressure_slope(static_cast<int>(e), g, 1);
       for (std::size_t q = 0; q < rule.size(); ++q) {
         const Reaction<dim>& r = reaction_[e * rule.size() + q];
-        Vec<dim> u = velocity_in(static_cast<int>(e), rule[q].l);
-        if (reaction_on_change) u -= velocity_in(static_cast<int>(e), rule[q].l, 1);
-        sum += rule[q].weight * g.volume * (r.beta_target + r.force - r.beta * u - r.yield * grad_p);
+        const Vec<dim> u = velocity_in(static_cast<int>(e), rule[q].l), change = u - velocity_in(static_cast<int>(e), rule[q].l, 1);
+        sum += rule[q].weight * g.volume * (r.beta_target + r.force - r.beta * (reaction_on_change ? change : u) - r.yield * grad_p - r.inertia * change);
       }
     }
   });

@@ -16,15 +16,16 @@ double Simulation<dim>::speed_gain(double h) const {
   for (int k = 0; k < n; ++k) {
     const Body<dim>& b = grains_.body[k];
     if (b.inv_m == 0) continue;
-    const double rate = drag_.coefficient[grains_.id[k]] * b.inv_m;
-    Vec<dim> a = gravity + rate * (drag_.velocity[grains_.id[k]] - b.v);
+    const int id = grains_.id[k];
+    const double rate = drag_.coefficient[id] * b.inv_m;
+    Vec<dim> a = gravity + rate * (drag_.velocity[id] - b.v);
     if (!grains_.force.empty()) a += b.inv_m * grains_.force[k];
-    most = std::max(most, a.norm() / (1.0 + h * rate));
+    most = std::max(most, a.norm() / (1.0 + h * rate + drag_.added_mass_of(id) * b.inv_m));
   }
   return h * (most + wall_acceleration_);
 }
 
-// m (v - v_before) = h gamma (u - v) + other impulses: to these a grain is as heavy as m + h gamma, for its translation only.
+// m (v - v_before) = h gamma (u - v) - m_a (v - v_before) + other impulses: to these a grain is as heavy as m + m_a + h gamma, for its translation only.
 // The true masses stay in body_before_.
 template <int dim>
 void Simulation<dim>::weigh(double h) {
@@ -34,7 +35,7 @@ void Simulation<dim>::weigh(double h) {
   for (int k = 0; k < n; ++k) {
     Body<dim>& b = grains_.body[k];
     if (b.inv_m == 0) continue;
-    const double heavier = 1.0 + h * drag_.coefficient[grains_.id[k]] * b.inv_m;
+    const double heavier = 1.0 + (drag_.added_mass_of(grains_.id[k]) + h * drag_.coefficient[grains_.id[k]]) * b.inv_m;
     b.inv_m /= heavier;
     spin_ratios_[k] *= heavier;
   }

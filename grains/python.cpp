@@ -425,15 +425,18 @@ void bind(py::module_& m, const char* suffix) {
       .def("set_force", [](Sim& s, const std::optional<Array>& f) {
              s.set_force(as_span<Vec<dim>>(f, "set_force", "force", s.count()));
            }, "force"_a, "External force on each grain from now on, (n, dim) [N] (2D: N/m); None: none.")
-      .def("set_drag", [](Sim& s, const std::optional<Array>& gamma, const std::optional<Array>& u) {
-             s.set_drag(as_span<double>(gamma, "set_drag", "coefficient", s.count()), as_span<Vec<dim>>(u, "set_drag", "velocity", s.count()));
-           }, "coefficient"_a, "velocity"_a = py::none(),
+      .def("set_drag", [](Sim& s, const std::optional<Array>& gamma, const std::optional<Array>& u, const std::optional<Array>& added_mass) {
+             s.set_drag(as_span<double>(gamma, "set_drag", "coefficient", s.count()), as_span<Vec<dim>>(u, "set_drag", "velocity", s.count()),
+                        as_span<double>(added_mass, "set_drag", "added_mass", s.count()));
+           }, "coefficient"_a, "velocity"_a = py::none(), "added_mass"_a = py::none(),
            "Drag of a fluid on each grain from now on: the force gamma (u - v), v the velocity at the end of each sub-step, so that any\n"
            "gamma is stable; it exerts no torque. Grains added later have none. set_drag(None): none.\n\n"
-           "Parameters\n----------\ncoefficient : gamma, (n,) [kg/s] (2D: kg/(m s))\nvelocity : u, (n, dim) [m/s]\n\n"
-           "Raises\n------\nValueError : a coefficient < 0, values that are not finite, sizes other than the number of grains")
+           "Parameters\n----------\ncoefficient : gamma, (n,) [kg/s] (2D: kg/(m s))\nvelocity : u, (n, dim) [m/s]\n"
+           "added_mass : m_a of the fluid that goes along with a grain, (n,) [kg] (2D: kg/m); None: none. The grain feels -m_a dv/dt besides: to contacts, drag,\n"
+           "    weight and forces it is as heavy as m + m_a, but spins as before; m_a Du/Dt of the fluid, where there is one, belongs to set_force\n\n"
+           "Raises\n------\nValueError : a coefficient or mass < 0, values that are not finite, sizes other than the number of grains")
       .def_property_readonly("drag_impulse", [](const Sim& s) { return to_numpy(std::vector<Vec<dim>>(s.drag_impulse())); },
-                             "(n, dim) impulse of the drag over the last step [N s] (2D: N s/m); ValueError without drag, as the next two")
+                             "(n, dim) impulse of the drag, and of -m_a dv/dt, over the last step [N s] (2D: N s/m); ValueError without drag, as the next two")
       .def_property_readonly("contact_impulse", [](const Sim& s) { return to_numpy(std::vector<Vec<dim>>(s.contact_impulse())); },
                              "(n, dim) impulse of all contacts of a grain together over the last step [N s] (2D: N s/m)")
       .def_property_readonly("in_contact", [](const Sim& s) {

@@ -103,6 +103,7 @@ int Simulation<dim>::add(std::span<const Vec<dim>> x, std::span<const double> ra
   if (!grains_.force.empty()) grains_.force.resize(grains_.x.size(), Vec<dim>::Zero());
   if (dragged()) {
     drag_.coefficient.resize(n_free_, 0.0);
+    if (!drag_.added_mass.empty()) drag_.added_mass.resize(n_free_, 0.0);
     for (auto* of_grain : {&drag_.velocity, &drag_.impulse, &drag_.contact_impulse}) of_grain->resize(n_free_, Vec<dim>::Zero());
     drag_.in_contact.resize(n_free_, 0);
   }
@@ -125,7 +126,7 @@ void Simulation<dim>::remove(std::span<const int> ids) {
       if (left[id] == 0) by_id[at++] = by_id[id];
     by_id.resize(at);
   };
-  keep_ids(drag_.coefficient), keep_ids(drag_.velocity), keep_ids(drag_.impulse), keep_ids(drag_.contact_impulse), keep_ids(drag_.in_contact);
+  keep_ids(drag_.coefficient), keep_ids(drag_.velocity), keep_ids(drag_.added_mass), keep_ids(drag_.impulse), keep_ids(drag_.contact_impulse), keep_ids(drag_.in_contact);
   n_free_ = 0;
   for (int& id : id_of)
     if (id == 0) id = n_free_++;
@@ -327,20 +328,24 @@ void Simulation<dim>::set_force(std::span<const Vec<dim>> force) {
 }
 
 template <int dim>
-void Simulation<dim>::set_drag(std::span<const double> coefficient, std::span<const Vec<dim>> velocity) {
-  if (coefficient.empty() && velocity.empty()) {
+void Simulation<dim>::set_drag(std::span<const double> coefficient, std::span<const Vec<dim>> velocity, std::span<const double> added_mass) {
+  if (coefficient.empty() && velocity.empty() && added_mass.empty()) {
     drag_ = {};
     spin_ratios_.clear();
   } else {
     set_by_id(coefficient.size(), "set_drag", "coefficient");
     set_by_id(velocity.size(), "set_drag", "velocity");
+    if (!added_mass.empty()) set_by_id(added_mass.size(), "set_drag", "added mass");
     for (std::size_t k = 0; k < coefficient.size(); ++k) {
       if (!(coefficient[k] >= 0) || !is_finite(coefficient[k]))
         fail("set_drag: coefficient must be >= 0 kg/s and finite, got {} (grain {})", coefficient[k], k);
       check_finite(velocity[k], "set_drag", "velocity [m/s]", k);
     }
+    for (std::size_t k = 0; k < added_mass.size(); ++k)
+      if (!(added_mass[k] >= 0) || !is_finite(added_mass[k])) fail("set_drag: added mass must be >= 0 kg and finite, got {} (grain {})", added_mass[k], k);
     drag_.coefficient.assign(coefficient.begin(), coefficient.end());
     drag_.velocity.assign(velocity.begin(), velocity.end());
+    drag_.added_mass.assign(added_mass.begin(), added_mass.end());
     for (auto* of_step : {&drag_.impulse, &drag_.contact_impulse}) of_step->resize(n_free_, Vec<dim>::Zero());
     drag_.in_contact.resize(n_free_, 0);
   }

@@ -96,7 +96,9 @@ class Simulation {
 
   // From now on a fluid drags every grain with gamma (u - v), v its velocity at the end of a sub-step: stable for any gamma. By id:
   // gamma [kg/s] (2D: kg/(m s)), u [m/s]. It exerts no torque. Empty: none. Grains added later have none.
-  void set_drag(std::span<const double> coefficient, std::span<const Vec<dim>> velocity);
+  // Fluid that goes along with a grain, m_a [kg] (2D: kg/m), has it feel -m_a dv/dt besides, implicit too: it is as heavy as m + m_a to all that pushes it,
+  // contacts included, in translation; weight and given forces act on m. Empty: none.
+  void set_drag(std::span<const double> coefficient, std::span<const Vec<dim>> velocity, std::span<const double> added_mass = {});
 
   void check(double dt);  // throws what step(dt) would refuse, and changes nothing
   StepReport<dim> step(double dt);
@@ -115,7 +117,7 @@ class Simulation {
   ContactList<dim> contacts() const;
 
   // What the last step did to each grain, by id: kept while there is drag; without it they throw std::invalid_argument.
-  const std::vector<Vec<dim>>& drag_impulse() const;       // sum of h gamma (u - v) [N s] (2D: N s/m)
+  const std::vector<Vec<dim>>& drag_impulse() const;       // sum of h gamma (u - v) - m_a (change of v) [N s] (2D: N s/m)
   const std::vector<Vec<dim>>& contact_impulse() const;    // of all contacts together [N s]
   const std::vector<std::uint8_t>& in_contact() const;     // whether any contact bore load in any sub-step
   // By id, bit k: along axis k the grain, or one that it hangs together with by contacts of the last sub-step that bear load, leans on a wall
@@ -196,6 +198,8 @@ class Simulation {
   struct Drag {  // by id; all empty: none
     std::vector<double> coefficient;     // gamma [kg/s] (2D: kg/(m s))
     std::vector<Vec<dim>> velocity;      // u [m/s]
+    std::vector<double> added_mass;      // m_a [kg] (2D: kg/m); empty: 0
+    double added_mass_of(int id) const { return added_mass.empty() ? 0.0 : added_mass[id]; }
     std::vector<Vec<dim>> impulse, contact_impulse;  // of the last step [N s] (2D: N s/m)
     std::vector<std::uint8_t> in_contact;
   } drag_;

@@ -42,7 +42,7 @@ struct Problem {
   std::span<const Tangent<dim>> wall_bias_t;
   Scratch& scratch;
   double spin_ratio;                              // m r^2/I [-]
-  // With drag a body's inverse mass is 1/(m + h gamma), but its spin is as light as ever: (m + h gamma) r^2/I per body [-]; empty: no drag.
+  // With drag a body's inverse mass is 1/(m + m_a + h gamma), but its spin is as light as ever: (m + m_a + h gamma) r^2/I per body [-]; empty: no drag.
   std::span<const double> spin_ratios;
   bool friction;                                  // false: no contact has any, and nothing turns
   int threads;

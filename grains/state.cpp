@@ -93,7 +93,7 @@ void Simulation<dim>::visit_state(Archive&& a) {
   a(settings), a(gravity), a(box_), a(time_), a(last_h_), a(n_free_), a(n_fixed_), a(walls_), a(places_checked_);
   a(grains_.x), a(grains_.body), a(grains_.r), a(grains_.id), a(grains_.wall), a(grains_.material), a(grains_.force);
   a(grains_.inertia), a(materials_.names_), a(materials_.pairs_);
-  a(drag_.coefficient), a(drag_.velocity), a(drag_.impulse), a(drag_.contact_impulse), a(drag_.in_contact);
+  a(drag_.coefficient), a(drag_.velocity), a(drag_.added_mass), a(drag_.impulse), a(drag_.contact_impulse), a(drag_.in_contact);
   neighbours_.visit_state(a);
   a(contacts_), a(wall_contacts_), a(count_);  // contacts() between two steps
 }

@@ -377,8 +377,9 @@ void Simulation<dim>::accelerate(double h) {
     for (int k = 0; k < n; ++k) {
       Body<dim>& b = grains_.body[k];
       if (b.inv_m == 0) continue;
-      b.v += h * gravity;
-      if (forced) b.v += h * b.inv_m * grains_.force[k];
+      const double share = drag_.added_mass.empty() ? h : h / (1.0 + drag_.added_mass[grains_.id[k]] * b.inv_m);  // h m/(m + m_a)
+      b.v += share * gravity;
+      if (forced) b.v += share * b.inv_m * grains_.force[k];
     }
   }
   if (dragged()) {
@@ -388,7 +389,7 @@ void Simulation<dim>::accelerate(double h) {
       Body<dim>& b = grains_.body[k];
       if (b.inv_m == 0) continue;
       const int id = grains_.id[k];
-      b.v += h * drag_.coefficient[id] * b.inv_m * (drag_.velocity[id] - b.v);  // (v + k u)/(1 + k), k = h gamma/m
+      b.v += h * drag_.coefficient[id] * b.inv_m * (drag_.velocity[id] - b.v);  // (v + k u)/(1 + k), k = h gamma/(m + m_a)
     }
   }
   for (Wall<dim>& wall : walls_) wall.v += h * wall.inv_m.cwiseProduct(wall.load);
@@ -675,7 +676,8 @@ void Simulation<dim>::account(double h, StepReport<dim>& report) {
     if (forced) f += grains_.force[k];
     if (dragged) {
       const int id = grains_.id[k];
-      const Vec<dim> drag = drag_.coefficient[id] * (drag_.velocity[id] - after.v);
+      Vec<dim> drag = drag_.coefficient[id] * (drag_.velocity[id] - after.v);
+      if (!drag_.added_mass.empty()) drag -= drag_.added_mass[id] / h * (after.v - before.v);
       drag_.impulse[id] += h * drag;
       f += drag;
     }

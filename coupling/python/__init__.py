@@ -5,7 +5,7 @@ from ._coupling import Coupling2D, Coupling3D, drag_coefficient
 LAWS = ("di_felice", "gidaspow", "beetstra")
 
 
-def Coupling(grains, fluid, *, kernel="smooth", kernel_radius=None, drag="di_felice", discs="spheres", undisturbed=False, fluid_moves=True, grains_move=True):
+def Coupling(grains, fluid, *, kernel="smooth", kernel_radius=None, drag="di_felice", discs="spheres", undisturbed=False, added_mass=0.0, fluid_moves=True, grains_move=True):
     """Couples a `Simulation` and a `Fluid` on a mesh that holds all of its grains; `step` makes the steps of both.
 
     Parameters
@@ -31,6 +31,11 @@ def Coupling(grains, fluid, *, kernel="smooth", kernel_radius=None, drag="di_fel
         3D: drag by the flow as it would be without the grain, whose own averaged wake is told in closed form (steady; of unbounded flow, slowed by the
         drag of grains around; about as long along all axes as elements are). A single grain then falls as the law says, not 5 to 25 % faster; in beds of
         solids above 0.1 it changes next to nothing.
+    added_mass : float
+        C_m [-]: a grain feels m_a (Du/Dt - dv/dt) besides, m_a = C_m times the fluid that it displaces, the fluid feels the opposite (Auton, Hunt and
+        Prud'homme, J. Fluid Mech. 197 (1988); Maxey and Riley, Phys. Fluids 26 (1983)). 0.5 of a sphere by itself, and of a disc that stands for a
+        column of spheres (displaced per metre of depth; of a cylinder 1); no dependence on the solid fraction. Du/Dt follows the fluid, mean over the kernel.
+        Grains much lighter than the fluid need it: without, they are unstable where pressure binds them to it.
     fluid_moves, grains_move : bool
         False: the fluid stays as it is and feels no grain; the grains stay where they are, a porous bed.
 
@@ -45,4 +50,4 @@ def Coupling(grains, fluid, *, kernel="smooth", kernel_radius=None, drag="di_fel
         kernel_radius = 3.0 * grains.radius.mean() if grains.count else 0.0
     if grains.dim != fluid.dim:
         raise ValueError(f"Coupling: grains in {grains.dim}D, fluid in {fluid.dim}D")
-    return {2: Coupling2D, 3: Coupling3D}[fluid.dim](grains, fluid, kernel, kernel_radius, drag, discs, undisturbed, fluid_moves, grains_move)
+    return {2: Coupling2D, 3: Coupling3D}[fluid.dim](grains, fluid, kernel, kernel_radius, drag, discs, undisturbed, added_mass, fluid_moves, grains_move)
