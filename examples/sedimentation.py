@@ -94,7 +94,7 @@ def run_block(flags):
         flow.wall(boundary)
     flow.mean_pressure(0.0)
     sim = grains.Simulation(dim=dim, gravity=down)
-    x, _ = random_bed([width - 1] * (dim - 1) + [block], flags.phi * width ** (dim - 1) / (width - 1) ** (dim - 1), flags.seed)
+    x, _, _ = random_bed([width - 1] * (dim - 1) + [block], flags.phi * width ** (dim - 1) / (width - 1) ** (dim - 1), flags.seed)
     x += [width / 2] * (dim - 1) + [height - 1 - block / 2]
     both = couple(flags, sim, flow)
     sim.add(x * d, d / 2, density=flags.density)
@@ -130,7 +130,7 @@ def run_homogeneous(flags):
     reynolds = flags.fluid_density * alone * d / flags.viscosity
     phis, speeds, reports, seconds, lowest = (0.05, 0.1, 0.2, 0.3, 0.4), [], [], 0.0, 1.0
     for phi in phis:
-        x, _ = random_bed([side] * dim, phi, flags.seed)
+        x, _, _ = random_bed([side] * dim, phi, flags.seed)
         length = side * d
         phi = len(x) * solid(flags) / length**dim
         mesh = meshes.box([length] * dim, [max(2, round(side / flags.mesh_over_d))] * dim, periodic=[True] * dim, origin=[-length / 2] * dim)
