@@ -30,12 +30,21 @@ def test_with_drag_by_the_undisturbed_flow_it_falls_as_the_law_says(tmp_path, di
     assert abs(found["error"]) < 0.015 and found["wake_over_slip"] > 0.005
 
 
-# Random beds: where they are denser the flow goes round, the finer the elements the better. Measured -0.47, -0.01, -0.10 and -1.4 %.
-@pytest.mark.parametrize("args, most", [((), 0.005), (("--mesh-over-d", 6), 0.005), (("--dim", 3), 0.005), (("--open",), 0.02)])
+# Random beds: drag is spread by the kernel and the flow goes round single grains, the finer the elements the better. Measured, mean and standard deviation of five seeds:
+# -0.63 (13), -0.08 (4), -0.10 (3) and 1.0 (1.0) %.
+@pytest.mark.parametrize("args, most", [((), 0.008), (("--mesh-over-d", 6), 0.005), (("--dim", 3), 0.005), (("--open",), 0.02)])
 def test_a_held_bed_has_the_pressure_gradient_of_the_law(tmp_path, args, most):
     found = results("packed_bed", tmp_path, *args)
     assert abs(found["error"]) < most
     assert found["momentum_error"] < 1e-11 and found["volume_error"] < 1e-10
+
+
+# Jammed discs have channels, and are off the law; let go, they keep the flow that they had when they were held. Measured: 0.06 %, 0.03 to 0.3 over five seeds. While what grains
+# answer to the pressure itself was in the equations, and not what they answer to its change, the bed slid away and 1 to 5 % were seen.
+def test_a_jammed_bed_that_is_let_go_stays_and_keeps_its_flow(tmp_path):
+    found = results("packed_bed", tmp_path, "--free")
+    assert abs(found["error"] - found["error_held"]) < 2.5e-3
+    assert found["grain_speed"] < 0.05 and found["momentum_error"] < 1e-11
 
 
 def test_the_hat_breaks_on_elements_of_a_diameter_and_says_so(tmp_path):
