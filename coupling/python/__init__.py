@@ -35,7 +35,8 @@ def Coupling(grains, fluid, *, kernel="smooth", kernel_radius=None, drag="di_fel
         C_m [-]: a grain feels m_a (Du/Dt - dv/dt) besides, m_a = C_m times the fluid that it displaces, the fluid feels the opposite (Auton, Hunt and
         Prud'homme, J. Fluid Mech. 197 (1988); Maxey and Riley, Phys. Fluids 26 (1983)). 0.5 of a sphere by itself, and of a disc that stands for a
         column of spheres (displaced per metre of depth; of a cylinder 1); no dependence on the solid fraction. Du/Dt follows the fluid, mean over the kernel.
-        Grains much lighter than the fluid need it: without, they are unstable where pressure binds them to it.
+        Grains of less than about a quarter of the fluid's density need it: without, they are unstable where pressure binds them to the fluid.
+        With fluid_moves=False it knows the flow's gradient only.
     fluid_moves, grains_move : bool
         False: the fluid stays as it is and feels no grain; the grains stay where they are, a porous bed.
 
