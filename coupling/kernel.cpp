@@ -83,6 +83,24 @@ Kernel<dim>::Kernel(std::shared_ptr<const Mesh<dim>> mesh, Shape shape, double r
 }
 
 template <int dim>
+[[gnu::always_inline]] inline auto Kernel<dim>::splines_at(const Vec<dim>& x) const -> Splines {
+  Splines at;
+  for (int k = 0; k < dim; ++k) {
+    const double t = (x[k] - origin_[k]) * (1 / spacing_[k]), cell = std::floor(t), f = t - cell, g = 1 - f;
+    at.first[k] = static_cast<int>(cell) - 1;
+    at.along[k] = {1.0 / 6 * g * g * g, 2.0 / 3 - f * f * (1 - 0.5 * f), 2.0 / 3 - g * g * (1 - 0.5 * g), 1.0 / 6 * f * f * f};
+  }
+  return at;
+}
+
+template <int dim>
+auto Kernel<dim>::sample_at(const Vec<dim>& x) const -> Sample {
+  Sample sample{splines_at(x)};
+  std::copy_n(sample.at.along[0].data(), 4, sample.row.data() + wide);
+  return sample;
+}
+
+template <int dim>
 void Kernel<dim>::place(const std::vector<Vec<dim>>& nodes) {
   masses_.assign(nodes.size(), 0.0);
   volumes_.clear();
@@ -112,12 +130,14 @@ void Kernel<dim>::place(const std::vector<Vec<dim>>& nodes) {
       if (const int spline = of * count_[0] + on_grid(first_[0] + m, 0); spline != g) images_.push_back({g, spline});
   }
   samples_.clear();
-  if (!in_element_.empty())
+  if (in_element_.empty())
+    for (const Vec<dim>& x : nodes) samples_.push_back(sample_at(x));
+  else
     for (const auto& element : mesh_->elements)
       for (const auto& sample : in_element_) {
         Vec<dim> x = Vec<dim>::Zero();
         for (int a = 0; a <= dim; ++a) x += sample.l[a] * nodes[element[a]];
-        samples_.push_back(splines_at(x));
+        samples_.push_back(sample_at(x));
       }
   row_start_.assign(1, 0), spline_.clear(), value_.clear();
   for (std::size_t k = 0; k < nodes.size(); ++k) {
@@ -133,65 +153,53 @@ void Kernel<dim>::place(const std::vector<Vec<dim>>& nodes) {
 // The splines that a node meets, gathered on the part of the grid that they lie in.
 template <int dim>
 void Kernel<dim>::add_row(int node, const std::vector<Vec<dim>>& nodes) {
-  auto each_sample = [&](auto&& use) {  // its splines, where they begin as seen from the node, N_a times its volume
-    if (in_element_.empty()) {
-      const Splines here = splines_at(nodes[node]);
-      return use(here, here.first, masses_[node]);
-    }
+  if (!in_element_.empty() && around_[node].empty()) return;
+  std::array<int, dim> low, size{};
+  low.fill(std::numeric_limits<int>::max());
+  seen_.clear();
+  if (in_element_.empty()) seen_.push_back({&samples_[node], samples_[node].at.first, masses_[node]});
+  else
     for (const auto& [element, corner] : around_[node]) {
       std::array<int, dim> shift{};  // of an image
       const Vec<dim> way = nodes[mesh_->elements[element][corner]] - nodes[node];
       for (int axis = 0; axis < dim; ++axis)
         if (periodic_[axis] > 0) shift[axis] = static_cast<int>(std::lround(way[axis] / spacing_[axis]));
       for (std::size_t s = 0; s < in_element_.size(); ++s) {
-        const Splines& sample = samples_[element * in_element_.size() + s];
-        std::array<int, dim> first = sample.first;
-        for (int axis = 0; axis < dim; ++axis) first[axis] -= shift[axis];
-        use(sample, first, in_element_[s].weight * in_element_[s].l[corner] * volumes_[element]);
+        const Sample& sample = samples_[element * in_element_.size() + s];
+        Seen& seen = seen_.emplace_back(Seen{&sample, sample.at.first, in_element_[s].weight * in_element_[s].l[corner] * volumes_[element]});
+        for (int axis = 0; axis < dim; ++axis) seen.first[axis] -= shift[axis];
       }
     }
-  };
-  std::array<int, dim> low, size{};
-  low.fill(std::numeric_limits<int>::max());
-  each_sample([&](const Splines&, const std::array<int, dim>& first, double) {
-    for (int axis = 0; axis < dim; ++axis) low[axis] = std::min(low[axis], first[axis]);
-  });
-  each_sample([&](const Splines&, const std::array<int, dim>& first, double) {
-    for (int axis = 0; axis < dim; ++axis) size[axis] = std::max(size[axis], first[axis] - low[axis] + 4);
-  });
-  const int rows = dim == 2 ? size[1] : size[1] * size[dim - 1];
-  window_.assign(rows * size[0], 0.0);
-  each_sample([&](const Splines& sample, const std::array<int, dim>& first, double weight) {
+  for (const Seen& seen : seen_)
+    for (int axis = 0; axis < dim; ++axis) low[axis] = std::min(low[axis], seen.first[axis]);
+  for (const Seen& seen : seen_)
+    for (int axis = 0; axis < dim; ++axis) size[axis] = std::max(size[axis], seen.first[axis] - low[axis] + 4);
+  // Rows begin alike and are whole vectors: sums over samples then stay where they are, and wait for no half of what was stored before.
+  const int rows = dim == 2 ? size[1] : size[1] * size[dim - 1], vectors = (size[0] + wide - 1) / wide;
+  window_.assign(rows * vectors, Wide::Zero());
+  for (const Seen& seen : seen_) {
+    const int at = seen.first[0] - low[0];
     for (int last = 0; last < 4; ++last)
       for (int middle = 0; middle < (dim == 3 ? 4 : 1); ++middle) {
-        int row = first[dim - 1] - low[dim - 1] + last;
-        double product = weight * sample.along[dim - 1][last];
-        if constexpr (dim == 3) row = row * size[1] + first[1] - low[1] + middle, product *= sample.along[1][middle];
-        Eigen::Map<Eigen::Array4d>(&window_[row * size[0] + first[0] - low[0]]) += product * Eigen::Map<const Eigen::Array4d>(sample.along[0].data());
+        int row = seen.first[dim - 1] - low[dim - 1] + last;
+        double product = seen.weight * seen.sample->at.along[dim - 1][last];
+        if constexpr (dim == 3) row = row * size[1] + seen.first[1] - low[1] + middle, product *= seen.sample->at.along[1][middle];
+        for (int v = at / wide; v <= (at + 3) / wide; ++v) window_[row * vectors + v] += product * Eigen::Map<const Wide>(&seen.sample->row[wide + v * wide - at]);
       }
-  });
+  }
   std::size_t k = spline_.size();
-  spline_.resize(k + window_.size()), value_.resize(k + window_.size());
+  spline_.resize(k + rows * size[0]), value_.resize(k + rows * size[0]);
   for (int row = 0; row < rows; ++row) {
     int from = on_grid(low[dim - 1] + (dim == 3 ? row / size[1] : row), dim - 1);
     if constexpr (dim == 3) from = from * count_[1] + on_grid(low[1] + row % size[1], 1);
+    const double* value = window_[row * vectors].data();
+    const int* column = &on_grid_[0][low[0] - before_[0]];
     for (int m = 0; m < size[0]; ++m) {
-      spline_[k] = from * count_[0] + on_grid(low[0] + m, 0), value_[k] = window_[row * size[0] + m];
-      k += value_[k] > 0;
+      spline_[k] = from * count_[0] + column[m], value_[k] = value[m];
+      k += value[m] > 0;
     }
   }
   spline_.resize(k), value_.resize(k);
-}
-
-template <int dim>
-auto Kernel<dim>::splines_at(const Vec<dim>& x) const -> Splines {
-  Splines at;
-  for (int k = 0; k < dim; ++k) {
-    const double t = (x[k] - origin_[k]) * (1 / spacing_[k]), cell = std::floor(t), f = t - cell, g = 1 - f;
-    at.first[k] = static_cast<int>(cell) - 1;
-    at.along[k] = {1.0 / 6 * g * g * g, 2.0 / 3 - f * f * (1 - 0.5 * f), 2.0 / 3 - g * g * (1 - 0.5 * g), 1.0 / 6 * f * f * f};
-  }
-  return at;
 }
 
 template <int dim>

@@ -74,7 +74,7 @@ struct ElementSystem {
 
 // 4/h^2 for a regular simplex of edge h: 2 |u|/sqrt(u . m u) is the length of the element along u [1/m^2].
 template <int dim>
-Mat<dim> metric(const Geometry<dim>& g) {
+[[gnu::always_inline]] inline Mat<dim> metric(const Geometry<dim>& g) {
   Mat<dim> m = Mat<dim>::Zero();
   for (const Vec<dim>& grad : g.grad_l) m += 2.0 * grad * grad.transpose();
   return m;
@@ -97,7 +97,7 @@ struct Stabilisation {
   double tau, bulk;
 };
 template <int dim, int order>
-Stabilisation<dim> stabilisation(const Mat<dim>& m, const Properties<dim>& fluid, const Vec<dim>& u, double rate, double beta_over_eps, double eps_jump) {
+[[gnu::always_inline]] inline Stabilisation<dim> stabilisation(const Mat<dim>& m, const Properties<dim>& fluid, const Vec<dim>& u, double rate, double beta_over_eps, double eps_jump) {
   constexpr double growth = order == 1 ? 40.0 : dim == 2 ? 200.0 : 0.0;
   const double advective = fluid.density * fluid.density * u.dot(m * u);
   const double viscous = 9.0 * fluid.viscosity * fluid.viscosity * m.squaredNorm();
@@ -123,7 +123,7 @@ struct AtPoint {
   Vec<dim> beside;                       // what only the subscales' residual has, and no unknown [N/m^3]
   Stabilisation<dim> stab;
 
-  AtPoint(const ElementInput<dim, order>& in, const Geometry<dim>& g, const Properties<dim>& fluid, const TimeWeights& time, int q) {
+  [[gnu::always_inline]] AtPoint(const ElementInput<dim, order>& in, const Geometry<dim>& g, const Mat<dim>& m, const Properties<dim>& fluid, const TimeWeights& time, int q) {
     const auto& point = quadrature<dim, order>()[q];
     const double rho = fluid.density;
     shape = shapes<dim, order>(point.l);
@@ -158,7 +158,6 @@ struct AtPoint {
     beside.setZero();
     for (int t = 0; t < 2; ++t)
       if (in.subscale[t]) beside += rho * time[t + 1] * in.subscale[t][q];
-    const Mat<dim> m = metric<dim>(g);
     eps_curvature.setZero();
     if constexpr (order == 1) {
       for (int a = 0; a < n; ++a) eps_curvature += 0.5 * (in.eps_slope[a] * grad[a].transpose() + grad[a] * in.eps_slope[a].transpose());
@@ -177,7 +176,7 @@ struct AtPoint {
   // What the viscous force -eps div(2 eta D(u)) is per unit of unknown b, column j by U_j: second derivatives of U/eps, U linear. Those of eps count as much
   // as its slope squared; elements do not have them, but their neighbours' slopes do, as K. Jansen, S. Collis, C. Whiting and F. Shakib have it for
   // velocities, CMAME 174 (1999). Order 1 only.
-  Mat<dim> viscous(int b, double eta) const {
+  [[gnu::always_inline]] Mat<dim> viscous(int b, double eta) const {
     static_assert(order == 1);
     const double inv_eps = 1.0 / eps;
     const Mat<dim> cross = grad[b] * grad_eps.transpose();
@@ -190,12 +189,13 @@ template <int dim, int order>
 void element_system(const ElementInput<dim, order>& in, const Properties<dim>& fluid, const TimeWeights& time, ElementSystem<dim, order>& out) {
   constexpr int n = shape_count<dim, order>;
   const Geometry<dim> g = geometry<dim>(in.x);
+  const Mat<dim> m = metric<dim>(g);
   const double rho = fluid.density, eta = fluid.viscosity;
   out.a.setZero(), out.b.setZero();
   const auto& rule = quadrature<dim, order>();
   for (std::size_t q = 0; q < rule.size(); ++q) {
     const double weight = rule[q].weight * g.volume;
-    const AtPoint<dim, order> at(in, g, fluid, time, static_cast<int>(q));
+    const AtPoint<dim, order> at(in, g, m, fluid, time, static_cast<int>(q));
     const auto& shape = at.shape;
     const auto& grad = at.grad;
     const Stabilisation<dim>& stab = at.stab;
@@ -262,8 +262,9 @@ void element_system(const ElementInput<dim, order>& in, const Properties<dim>& f
 template <int dim>
 void element_subscale(const ElementInput<dim, 1>& in, const Properties<dim>& fluid, const TimeWeights& time, const std::array<Vec<dim>, dim + 1>& found, const std::array<double, dim + 1>& p, Vec<dim>* out) {
   const Geometry<dim> g = geometry<dim>(in.x);
+  const Mat<dim> m = metric<dim>(g);
   for (std::size_t q = 0; q < quadrature<dim, 1>().size(); ++q) {
-    const AtPoint<dim, 1> at(in, g, fluid, time, static_cast<int>(q));
+    const AtPoint<dim, 1> at(in, g, m, fluid, time, static_cast<int>(q));
     Vec<dim> residual = at.beside - at.load;
     for (int b = 0; b <= dim; ++b) residual += at.drives * p[b] * at.grad[b] + at.inertia[b] * found[b] + at.viscous(b, fluid.viscosity) * found[b];
     out[q] = -at.stab.tau * residual;

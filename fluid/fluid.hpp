@@ -211,6 +211,10 @@ class Fluid {
     Mat<dim> stress;   // 2 eta D(u) [Pa]
     double eps;
   };
+  template <int order>
+  InElement flow_at(int element, const Barycentric<dim>& l, const Geometry<dim>& g) const;
+  template <int order>
+  Vec<dim> velocity_at(int element, const Barycentric<dim>& l, int steps_ago) const;
   InElement flow_in(int element, const Barycentric<dim>& l, const Geometry<dim>& g) const;
   double pressure_in(int element, const Barycentric<dim>& l) const;
   Vec<dim> pressure_slope(int element, const Geometry<dim>& g) const;
