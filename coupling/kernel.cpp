@@ -94,13 +94,6 @@ template <int dim>
 }
 
 template <int dim>
-auto Kernel<dim>::sample_at(const Vec<dim>& x) const -> Sample {
-  Sample sample{splines_at(x)};
-  std::copy_n(sample.at.along[0].data(), 4, sample.row.data() + wide);
-  return sample;
-}
-
-template <int dim>
 void Kernel<dim>::place(const std::vector<Vec<dim>>& nodes) {
   masses_.assign(nodes.size(), 0.0);
   volumes_.clear();
@@ -131,13 +124,13 @@ void Kernel<dim>::place(const std::vector<Vec<dim>>& nodes) {
   }
   samples_.clear();
   if (in_element_.empty())
-    for (const Vec<dim>& x : nodes) samples_.push_back(sample_at(x));
+    for (const Vec<dim>& x : nodes) samples_.push_back(splines_at(x));
   else
     for (const auto& element : mesh_->elements)
       for (const auto& sample : in_element_) {
         Vec<dim> x = Vec<dim>::Zero();
         for (int a = 0; a <= dim; ++a) x += sample.l[a] * nodes[element[a]];
-        samples_.push_back(sample_at(x));
+        samples_.push_back(splines_at(x));
       }
   row_start_.assign(1, 0), spline_.clear(), value_.clear();
   for (std::size_t k = 0; k < nodes.size(); ++k) {
@@ -157,7 +150,7 @@ void Kernel<dim>::add_row(int node, const std::vector<Vec<dim>>& nodes) {
   std::array<int, dim> low, size{};
   low.fill(std::numeric_limits<int>::max());
   seen_.clear();
-  if (in_element_.empty()) seen_.push_back({&samples_[node], samples_[node].at.first, masses_[node]});
+  if (in_element_.empty()) seen_.push_back({&samples_[node], samples_[node].first, masses_[node]});
   else
     for (const auto& [element, corner] : around_[node]) {
       std::array<int, dim> shift{};  // of an image
@@ -165,8 +158,8 @@ void Kernel<dim>::add_row(int node, const std::vector<Vec<dim>>& nodes) {
       for (int axis = 0; axis < dim; ++axis)
         if (periodic_[axis] > 0) shift[axis] = static_cast<int>(std::lround(way[axis] / spacing_[axis]));
       for (std::size_t s = 0; s < in_element_.size(); ++s) {
-        const Sample& sample = samples_[element * in_element_.size() + s];
-        Seen& seen = seen_.emplace_back(Seen{&sample, sample.at.first, in_element_[s].weight * in_element_[s].l[corner] * volumes_[element]});
+        const Splines& sample = samples_[element * in_element_.size() + s];
+        Seen& seen = seen_.emplace_back(Seen{&sample, sample.first, in_element_[s].weight * in_element_[s].l[corner] * volumes_[element]});
         for (int axis = 0; axis < dim; ++axis) seen.first[axis] -= shift[axis];
       }
     }
@@ -174,25 +167,26 @@ void Kernel<dim>::add_row(int node, const std::vector<Vec<dim>>& nodes) {
     for (int axis = 0; axis < dim; ++axis) low[axis] = std::min(low[axis], seen.first[axis]);
   for (const Seen& seen : seen_)
     for (int axis = 0; axis < dim; ++axis) size[axis] = std::max(size[axis], seen.first[axis] - low[axis] + 4);
-  // Rows begin alike and are whole vectors: sums over samples then stay where they are, and wait for no half of what was stored before.
-  const int rows = dim == 2 ? size[1] : size[1] * size[dim - 1], vectors = (size[0] + wide - 1) / wide;
-  window_.assign(rows * vectors, Wide::Zero());
+  const int rows = dim == 2 ? size[1] : size[1] * size[dim - 1];
+  window_.assign(rows * size[0], 0.0);
   for (const Seen& seen : seen_) {
-    const int at = seen.first[0] - low[0];
-    for (int last = 0; last < 4; ++last)
-      for (int middle = 0; middle < (dim == 3 ? 4 : 1); ++middle) {
-        int row = seen.first[dim - 1] - low[dim - 1] + last;
-        double product = seen.weight * seen.sample->at.along[dim - 1][last];
-        if constexpr (dim == 3) row = row * size[1] + seen.first[1] - low[1] + middle, product *= seen.sample->at.along[1][middle];
-        for (int v = at / wide; v <= (at + 3) / wide; ++v) window_[row * vectors + v] += product * Eigen::Map<const Wide>(&seen.sample->row[wide + v * wide - at]);
-      }
+    int row = seen.first[dim - 1] - low[dim - 1];
+    if constexpr (dim == 3) row = row * size[1] + seen.first[1] - low[1];
+    double* to = &window_[row * size[0] + seen.first[0] - low[0]];
+    const Eigen::Array4d along = seen.weight * Eigen::Map<const Eigen::Array4d>(seen.sample->along[0].data());
+    for (int last = 0; last < 4; ++last) {
+      const double outer = seen.sample->along[dim - 1][last];
+      if constexpr (dim == 2) Eigen::Map<Eigen::Array4d>(to + last * size[0]) += outer * along;
+      else
+        for (int middle = 0; middle < 4; ++middle) Eigen::Map<Eigen::Array4d>(to + (last * size[1] + middle) * size[0]) += outer * seen.sample->along[1][middle] * along;
+    }
   }
   std::size_t k = spline_.size();
   spline_.resize(k + rows * size[0]), value_.resize(k + rows * size[0]);
   for (int row = 0; row < rows; ++row) {
     int from = on_grid(low[dim - 1] + (dim == 3 ? row / size[1] : row), dim - 1);
     if constexpr (dim == 3) from = from * count_[1] + on_grid(low[1] + row % size[1], 1);
-    const double* value = window_[row * vectors].data();
+    const double* value = &window_[row * size[0]];
     const int* column = &on_grid_[0][low[0] - before_[0]];
     for (int m = 0; m < size[0]; ++m) {
       spline_[k] = from * count_[0] + column[m], value_[k] = value[m];

@@ -51,19 +51,12 @@ class Kernel {
     std::array<int, dim> first;
     std::array<std::array<double, 4>, dim> along;
   };
-  static constexpr int wide = 8;
-  using Wide = Eigen::Array<double, wide, 1>;
-  struct Sample {  // a point of the integral over y
-    Splines at;
-    std::array<double, 3 * wide> row{};  // along[0] from number `wide` on, zeros before and behind
-  };
   struct Seen {    // from a node
-    const Sample* sample;
+    const Splines* sample;
     std::array<int, dim> first;
     double weight;  // N_a times its volume
   };
   Splines splines_at(const Vec<dim>& x) const;
-  Sample sample_at(const Vec<dim>& x) const;
   int on_grid(int number, int axis) const { return on_grid_[axis][number - before_[axis]]; }
   template <class Use>
   void each_weight(int i, Use&& use) const {
@@ -91,11 +84,11 @@ class Kernel {
   std::array<int, dim> before_;
   std::vector<fluid::QuadraturePoint<dim>> in_element_;  // the samples; empty: nodes
   std::vector<std::vector<std::array<int, 2>>> around_;  // of each node, the elements there and which of their corners it is
-  std::vector<Sample> samples_;                          // of each element, or of each node
+  std::vector<Splines> samples_;                         // of each element, or of each node
   std::vector<double> volumes_, masses_;
   std::vector<double> inv_spline_weight_;                // 1/w_g; 0 where no sample meets the spline
   std::vector<Seen> seen_;
-  std::vector<Wide> window_;
+  std::vector<double> window_;
   // int N_a B_g, of each node a the splines g that it meets; nothing of images.
   std::vector<int> row_start_, spline_;
   std::vector<double> value_;

@@ -185,8 +185,23 @@ struct AtPoint {
   }
 };
 
+// The residual of the momentum at a quadrature point as what is found makes it, and what that makes of the subscale; order 1.
+template <int dim>
+struct Residual {
+  double tau, drives;
+  Vec<dim> rest;
+  std::array<Vec<dim>, dim + 1> grad;
+  std::array<Mat<dim>, dim + 1> by_flux;
+  Vec<dim> subscale(const std::array<Vec<dim>, dim + 1>& flux, const std::array<double, dim + 1>& p) const {
+    Vec<dim> residual = rest;
+    for (int b = 0; b <= dim; ++b) residual += drives * p[b] * grad[b] + by_flux[b] * flux[b];
+    return -tau * residual;
+  }
+};
+
+// residual: at each quadrature point, or none is kept; order 1, without Newton's derivative.
 template <int dim, int order>
-void element_system(const ElementInput<dim, order>& in, const Properties<dim>& fluid, const TimeWeights& time, ElementSystem<dim, order>& out) {
+void element_system(const ElementInput<dim, order>& in, const Properties<dim>& fluid, const TimeWeights& time, ElementSystem<dim, order>& out, Residual<dim>* residual = nullptr) {
   constexpr int n = shape_count<dim, order>;
   const Geometry<dim> g = geometry<dim>(in.x);
   const Mat<dim> m = metric<dim>(g);
@@ -241,6 +256,7 @@ void element_system(const ElementInput<dim, order>& in, const Properties<dim>& f
         strong[b] = viscous[b] + at.inertia[b] * Mat<dim>::Identity();
         if (in.newton) strong[b] += rho * shape[b] * at.slope;
       }
+      if (residual) residual[q] = {stab.tau, at.drives, at.beside - at.load, grad, strong};
       for (int a = 0; a < n; ++a) {
         const double along = weight * stab.tau * rho * at.relative.dot(grad[a]);
         const Vec<dim> test = weight * stab.tau * grad[a];  // PSPG: continuity holds for U less tau times the residual
@@ -265,9 +281,9 @@ void element_subscale(const ElementInput<dim, 1>& in, const Properties<dim>& flu
   const Mat<dim> m = metric<dim>(g);
   for (std::size_t q = 0; q < quadrature<dim, 1>().size(); ++q) {
     const AtPoint<dim, 1> at(in, g, m, fluid, time, static_cast<int>(q));
-    Vec<dim> residual = at.beside - at.load;
-    for (int b = 0; b <= dim; ++b) residual += at.drives * p[b] * at.grad[b] + at.inertia[b] * found[b] + at.viscous(b, fluid.viscosity) * found[b];
-    out[q] = -at.stab.tau * residual;
+    Residual<dim> residual{at.stab.tau, at.drives, at.beside - at.load, at.grad, {}};
+    for (int b = 0; b <= dim; ++b) residual.by_flux[b] = at.viscous(b, fluid.viscosity) + at.inertia[b] * Mat<dim>::Identity();
+    out[q] = residual.subscale(found, p);
   }
 }
 

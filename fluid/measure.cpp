@@ -216,17 +216,15 @@ double Fluid<dim>::yield_at(const std::array<int, dim + 1>& corners, const Baryc
 
 template <int dim>
 template <int order>
-[[gnu::always_inline]] inline auto Fluid<dim>::flow_at(int element, const Barycentric<dim>& l, const Geometry<dim>& g) const -> InElement {
+[[gnu::always_inline]] inline auto Fluid<dim>::flow_at(const AtNodes<order>& nodes, const Barycentric<dim>& l, const Geometry<dim>& g) const -> InElement {
   double eps = 0.0;
   Vec<dim> flux = Vec<dim>::Zero(), grad_eps = Vec<dim>::Zero();
   Mat<dim> slope = Mat<dim>::Zero();
   const auto shape = shapes<dim, order>(l);
   const auto grad = shape_gradients<dim, order>(l, g.grad_l);
-  const int* node = &space_.node_of[element * shape_count<dim, order>];
   for (int a = 0; a < shape_count<dim, order>; ++a) {
-    const Vec<dim> here = Eigen::Map<const Vec<dim>>(&x_[0][space_.first_dof[node[a]]]);
-    eps += shape[a] * eps_[1][node[a]], grad_eps += eps_[1][node[a]] * grad[a];
-    flux += shape[a] * here, slope += here * grad[a].transpose();
+    eps += shape[a] * nodes.eps[a], grad_eps += nodes.eps[a] * grad[a];
+    flux += shape[a] * nodes.flux[a], slope += nodes.flux[a] * grad[a].transpose();
   }
   const double inv_eps = 1 / eps;
   const Vec<dim> u = inv_eps * flux;
@@ -235,8 +233,17 @@ template <int order>
 }
 
 template <int dim>
+template <int order>
+[[gnu::always_inline]] inline auto Fluid<dim>::at_nodes(int element) const -> AtNodes<order> {
+  AtNodes<order> at;
+  const int* node = &space_.node_of[element * shape_count<dim, order>];
+  for (int a = 0; a < shape_count<dim, order>; ++a) at.eps[a] = eps_[1][node[a]], at.flux[a] = Eigen::Map<const Vec<dim>>(&x_[0][space_.first_dof[node[a]]]);
+  return at;
+}
+
+template <int dim>
 auto Fluid<dim>::flow_in(int element, const Barycentric<dim>& l, const Geometry<dim>& g) const -> InElement {
-  return velocity_order() == 1 ? flow_at<1>(element, l, g) : flow_at<2>(element, l, g);
+  return velocity_order() == 1 ? flow_at<1>(at_nodes<1>(element), l, g) : flow_at<2>(at_nodes<2>(element), l, g);
 }
 
 template <int dim>
@@ -250,8 +257,9 @@ auto Fluid<dim>::projected() const -> Projected {
       std::array<Vec<dim>, dim + 1> velocity;
       velocity.fill(Vec<dim>::Zero());
       Mat<dim> stress = Mat<dim>::Zero();
+      const auto nodes = at_nodes<order>(static_cast<int>(e));
       for (const auto& point : quadrature<dim, order>()) {
-        const InElement there = flow_at<order>(static_cast<int>(e), point.l, g);
+        const InElement there = flow_at<order>(nodes, point.l, g);
         const double weight = point.weight * g.volume;
         for (int a = 0; a <= dim; ++a) velocity[a] += weight * point.l[a] * there.u;
         stress += weight * there.stress;
