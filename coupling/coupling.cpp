@@ -19,9 +19,17 @@ double seconds() { return std::chrono::duration<double>(std::chrono::steady_cloc
 
 }  // namespace
 
-DragLaw of_each(double (*law)(const Suspension&)) {
+DragLaw of_each(Eight (*law)(const Suspensions&)) {
   return [law](std::span<const Suspension> s, std::span<double> gamma) {
-    for (std::size_t k = 0; k < s.size(); ++k) gamma[k] = law(s[k]);
+    for (std::size_t from = 0; from < s.size(); from += 8) {
+      Suspensions eight;
+      for (int k = 0; k < 8; ++k) {
+        const Suspension& one = s[std::min(from + k, s.size() - 1)];
+        eight.diameter[k] = one.diameter, eight.eps[k] = one.eps, eight.slip[k] = one.slip, eight.density[k] = one.density, eight.viscosity[k] = one.viscosity;
+      }
+      const Eight here = law(eight);
+      std::copy_n(here.data(), std::min<std::size_t>(8, s.size() - from), gamma.begin() + from);
+    }
   };
 }
 
@@ -48,7 +56,7 @@ Coupling<dim>::Coupling(Simulation<dim>& grains, fluid::Fluid<dim>& fluid, Setti
     // have to be new in most steps. What it leaves open is momentum lost.
     if (!fluid_.settings.linear) {
       const bool ilu = fluid_.velocity_order() == 1 && (dim == 3 || fluid_.space().dofs() < 20000);
-      fluid_.settings.linear = fluid::LinearSettings{.method = ilu ? fluid::Method::ilu : dim == 2 ? fluid::Method::direct : fluid::Method::fieldsplit};
+      fluid_.settings.linear = fluid::LinearSettings{.method = ilu ? fluid::Method::ilu : dim == 2 ? fluid::Method::direct : fluid::Method::fieldsplit, .levels = dim == 2 ? 1 : 0};
     }
     fluid_.settings.linear->tolerance = 1e-13;
     fluid_.grains_follow = settings.grains_move;
@@ -168,6 +176,7 @@ typename Coupling<dim>::Own Coupling<dim>::own(int i) const {
 template <int dim>
 void Coupling<dim>::linearise(const std::vector<int>& which, const std::vector<Vec<dim>>& slip, std::vector<double>& growth) {
   std::vector<Suspension> seen;
+  seen.reserve(which.size());
   for (const int i : which) {
     double eps = eps_at_[i];
     if (dim == 2 && settings.discs == Discs::spheres) eps = void_fraction_of_spheres(eps);

@@ -45,7 +45,7 @@ namespace quicksand::coupling {
 
 // gamma [kg/s] of spheres; one call for many.
 using DragLaw = std::function<void(std::span<const Suspension>, std::span<double> gamma)>;
-DragLaw of_each(double (*law)(const Suspension&));
+DragLaw of_each(Eight (*law)(const Suspensions&));
 
 struct Settings {
   Shape kernel = Shape::smooth;

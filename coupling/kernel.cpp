@@ -3,6 +3,7 @@
 #include "meshes/errors.hpp"
 
 #include <algorithm>
+#include <limits>
 
 namespace quicksand::coupling {
 
@@ -54,7 +55,7 @@ constexpr double apart_at_most = 0.8;  // of samples, in spacings of the splines
 }  // namespace
 
 template <int dim>
-Kernel<dim>::Kernel(std::shared_ptr<const Mesh<dim>> mesh, Shape shape, double radius, const Vec<dim>& period) : mesh_(std::move(mesh)), shape_(shape), per_grain_(shape == Shape::hat ? dim + 1 : splines) {
+Kernel<dim>::Kernel(std::shared_ptr<const Mesh<dim>> mesh, Shape shape, double radius, const Vec<dim>& period) : mesh_(std::move(mesh)), shape_(shape) {
   if (shape_ == Shape::smooth) {
     if (!(radius > 0 && std::isfinite(radius))) meshes::fail("Coupling: kernel_radius must be > 0 m and finite, got {}", radius);
     origin_ = mesh_->nodes[0];
@@ -73,100 +74,155 @@ Kernel<dim>::Kernel(std::shared_ptr<const Mesh<dim>> mesh, Shape shape, double r
       for (double apart = std::pow(largest / in_part, 1.0 / dim); apart > apart_at_most * wanted && halvings < 8; apart *= 0.5) ++halvings;
       if (halvings > 5) meshes::fail("Coupling: kernel_radius = {} m is too small for elements of {} m^{}: take kernel=\"hat\", a finer mesh or a larger radius", radius, largest, dim);
       in_element_ = samples_of_parts<dim>(halvings);
+      around_.resize(mesh_->nodes.size());
+      for (std::size_t e = 0; e < mesh_->elements.size(); ++e)
+        for (int a = 0; a <= dim; ++a) around_[mesh_->master[mesh_->elements[e][a]]].push_back({static_cast<int>(e), a});
     }
   }
   place(mesh_->nodes);
 }
 
 template <int dim>
+[[gnu::always_inline]] inline auto Kernel<dim>::splines_at(const Vec<dim>& x) const -> Splines {
+  Splines at;
+  for (int k = 0; k < dim; ++k) {
+    const double t = (x[k] - origin_[k]) * (1 / spacing_[k]), cell = std::floor(t), f = t - cell, g = 1 - f;
+    at.first[k] = static_cast<int>(cell) - 1;
+    at.along[k] = {1.0 / 6 * g * g * g, 2.0 / 3 - f * f * (1 - 0.5 * f), 2.0 / 3 - g * g * (1 - 0.5 * g), 1.0 / 6 * f * f * f};
+  }
+  return at;
+}
+
+template <int dim>
 void Kernel<dim>::place(const std::vector<Vec<dim>>& nodes) {
   masses_.assign(nodes.size(), 0.0);
+  volumes_.clear();
   for (const auto& element : mesh_->elements) {
-    const double share = fluid::geometry<dim>(nodes, element).volume / (dim + 1);
-    for (const int k : element) masses_[mesh_->master[k]] += share;
+    volumes_.push_back(fluid::geometry<dim>(nodes, element).volume);
+    for (const int k : element) masses_[mesh_->master[k]] += volumes_.back() / (dim + 1);
   }
   for (std::size_t k = 0; k < nodes.size(); ++k) masses_[k] = masses_[mesh_->master[k]];
   if (shape_ == Shape::hat) return;
   Vec<dim> low = nodes[0], high = low;
   for (const Vec<dim>& x : nodes) low = low.cwiseMin(x), high = high.cwiseMax(x);
-  std::size_t total = 1;
   for (int k = 0; k < dim; ++k) {
-    first_[k] = periodic_[k] > 0 ? 0 : static_cast<int>(std::floor((low[k] - origin_[k]) / spacing_[k])) - 1;
-    count_[k] = periodic_[k] > 0 ? periodic_[k] : static_cast<int>(std::floor((high[k] - origin_[k]) / spacing_[k])) + 3 - first_[k];
-    total *= count_[k];
+    first_[k] = static_cast<int>(std::floor((low[k] - origin_[k]) / spacing_[k])) - 2;
+    count_[k] = static_cast<int>(std::floor((high[k] - origin_[k]) / spacing_[k])) + 4 - first_[k];
+    // Splines of an element, as seen from one of its nodes on the other side of the mesh.
+    before_[k] = first_[k] - count_[k];
+    on_grid_[k].resize(3 * count_[k]);
+    for (int n = 0; n < 3 * count_[k]; ++n)
+      on_grid_[k][n] = periodic_[k] > 0 ? (n + (periodic_[k] - 1) * count_[k]) % periodic_[k] : std::clamp(n - count_[k], 0, count_[k] - 1);
+  }
+  images_.clear();
+  const int rows = dim == 2 ? count_[1] : count_[1] * count_[dim - 1];
+  for (int row = 0, g = 0; row < rows; ++row) {
+    int of = on_grid(first_[dim - 1] + (dim == 3 ? row / count_[1] : row), dim - 1);
+    if constexpr (dim == 3) of = of * count_[1] + on_grid(first_[1] + row % count_[1], 1);
+    for (int m = 0; m < count_[0]; ++m, ++g)
+      if (const int spline = of * count_[0] + on_grid(first_[0] + m, 0); spline != g) images_.push_back({g, spline});
   }
   samples_.clear();
-  auto add = [&](const Vec<dim>& x, double volume, const std::array<int, dim + 1>& node, const Barycentric<dim>& l) {
-    Sample& sample = samples_.emplace_back();
-    sample.node = node, sample.l = l, sample.volume = volume;
-    splines_at(x, sample.spline.data(), sample.b.data());
-  };
-  if (in_element_.empty()) {
-    for (std::size_t k = 0; k < nodes.size(); ++k) {
-      if (mesh_->master[k] != static_cast<int>(k)) continue;
-      std::array<int, dim + 1> node;
-      node.fill(static_cast<int>(k));
-      add(nodes[k], masses_[k], node, {1.0});
-    }
-  } else {
-    for (const auto& element : mesh_->elements) {
-      const double volume = fluid::geometry<dim>(nodes, element).volume;
-      std::array<int, dim + 1> node;
-      for (int a = 0; a <= dim; ++a) node[a] = mesh_->master[element[a]];
-      for (const auto& [l, share] : in_element_) {
+  if (in_element_.empty())
+    for (const Vec<dim>& x : nodes) samples_.push_back(splines_at(x));
+  else
+    for (const auto& element : mesh_->elements)
+      for (const auto& sample : in_element_) {
         Vec<dim> x = Vec<dim>::Zero();
-        for (int a = 0; a <= dim; ++a) x += l[a] * nodes[element[a]];
-        add(x, share * volume, node, l);
+        for (int a = 0; a <= dim; ++a) x += sample.l[a] * nodes[element[a]];
+        samples_.push_back(splines_at(x));
       }
-    }
+  row_start_.assign(1, 0), spline_.clear(), value_.clear();
+  for (std::size_t k = 0; k < nodes.size(); ++k) {
+    if (mesh_->master[k] == static_cast<int>(k)) add_row(static_cast<int>(k), nodes);
+    row_start_.push_back(static_cast<int>(spline_.size()));
   }
-  spline_weight_.assign(total, 0.0);
-  for (const Sample& s : samples_)
-    for (int k = 0; k < splines; ++k) spline_weight_[s.spline[k]] += s.volume * s.b[k];
+  inv_spline_weight_.assign(rows * count_[0], 0.0);
+  for (std::size_t k = 0; k < spline_.size(); ++k) inv_spline_weight_[spline_[k]] += value_[k];
+  for (double& w : inv_spline_weight_) w = w > 0 ? 1 / w : 0.0;
+  for (const auto& [image, spline] : images_) inv_spline_weight_[image] = inv_spline_weight_[spline];
 }
 
-// The cubic B-splines at x and their numbers.
+// The splines that a node meets, gathered on the part of the grid that they lie in.
 template <int dim>
-void Kernel<dim>::splines_at(const Vec<dim>& x, int* spline, double* b) const {
-  std::array<std::array<double, 4>, dim> along;
-  std::array<std::array<int, 4>, dim> number;
-  for (int k = 0; k < dim; ++k) {
-    const double t = (x[k] - origin_[k]) / spacing_[k], cell = std::floor(t), f = t - cell, g = 1 - f;
-    along[k] = {g * g * g / 6, 2.0 / 3 - f * f * (1 - 0.5 * f), 2.0 / 3 - g * g * (1 - 0.5 * g), f * f * f / 6};
-    for (int m = 0; m < 4; ++m) {
-      int n = static_cast<int>(cell) - 1 + m - first_[k];
-      while (periodic_[k] > 0 && n < 0) n += periodic_[k];
-      while (periodic_[k] > 0 && n >= periodic_[k]) n -= periodic_[k];
-      number[k][m] = std::clamp(n, 0, count_[k] - 1);  // of a grain that rounding puts beyond the mesh
+void Kernel<dim>::add_row(int node, const std::vector<Vec<dim>>& nodes) {
+  if (!in_element_.empty() && around_[node].empty()) return;
+  std::array<int, dim> low, size{};
+  low.fill(std::numeric_limits<int>::max());
+  seen_.clear();
+  if (in_element_.empty()) seen_.push_back({&samples_[node], samples_[node].first, masses_[node]});
+  else
+    for (const auto& [element, corner] : around_[node]) {
+      std::array<int, dim> shift{};  // of an image
+      const Vec<dim> way = nodes[mesh_->elements[element][corner]] - nodes[node];
+      for (int axis = 0; axis < dim; ++axis)
+        if (periodic_[axis] > 0) shift[axis] = static_cast<int>(std::lround(way[axis] / spacing_[axis]));
+      for (std::size_t s = 0; s < in_element_.size(); ++s) {
+        const Splines& sample = samples_[element * in_element_.size() + s];
+        Seen& seen = seen_.emplace_back(Seen{&sample, sample.first, in_element_[s].weight * in_element_[s].l[corner] * volumes_[element]});
+        for (int axis = 0; axis < dim; ++axis) seen.first[axis] -= shift[axis];
+      }
+    }
+  for (const Seen& seen : seen_)
+    for (int axis = 0; axis < dim; ++axis) low[axis] = std::min(low[axis], seen.first[axis]);
+  for (const Seen& seen : seen_)
+    for (int axis = 0; axis < dim; ++axis) size[axis] = std::max(size[axis], seen.first[axis] - low[axis] + 4);
+  const int rows = dim == 2 ? size[1] : size[1] * size[dim - 1];
+  window_.assign(rows * size[0], 0.0);
+  for (const Seen& seen : seen_) {
+    int row = seen.first[dim - 1] - low[dim - 1];
+    if constexpr (dim == 3) row = row * size[1] + seen.first[1] - low[1];
+    double* to = &window_[row * size[0] + seen.first[0] - low[0]];
+    const Eigen::Array4d along = seen.weight * Eigen::Map<const Eigen::Array4d>(seen.sample->along[0].data());
+    for (int last = 0; last < 4; ++last) {
+      const double outer = seen.sample->along[dim - 1][last];
+      if constexpr (dim == 2) Eigen::Map<Eigen::Array4d>(to + last * size[0]) += outer * along;
+      else
+        for (int middle = 0; middle < 4; ++middle) Eigen::Map<Eigen::Array4d>(to + (last * size[1] + middle) * size[0]) += outer * seen.sample->along[1][middle] * along;
     }
   }
-  int at = 0;
-  for (int last = 0; last < 4; ++last)
-    for (int middle = 0; middle < (dim == 3 ? 4 : 1); ++middle) {
-      int row = number[dim - 1][last];
-      double product = along[dim - 1][last];
-      if constexpr (dim == 3) row = row * count_[1] + number[1][middle], product *= along[1][middle];
-      for (int m = 0; m < 4; ++m, ++at) spline[at] = row * count_[0] + number[0][m], b[at] = product * along[0][m];
+  std::size_t k = spline_.size();
+  spline_.resize(k + rows * size[0]), value_.resize(k + rows * size[0]);
+  for (int row = 0; row < rows; ++row) {
+    int from = on_grid(low[dim - 1] + (dim == 3 ? row / size[1] : row), dim - 1);
+    if constexpr (dim == 3) from = from * count_[1] + on_grid(low[1] + row % size[1], 1);
+    const double* value = &window_[row * size[0]];
+    const int* column = &on_grid_[0][low[0] - before_[0]];
+    for (int m = 0; m < size[0]; ++m) {
+      spline_[k] = from * count_[0] + column[m], value_[k] = value[m];
+      k += value[m] > 0;
     }
+  }
+  spline_.resize(k), value_.resize(k);
 }
 
 template <int dim>
 void Kernel<dim>::weigh(std::span<const Vec<dim>> x, const std::vector<Place<dim>>& places) {
-  carrier_.resize(x.size() * per_grain_), weight_.resize(carrier_.size());
+  if (shape_ == Shape::hat) {
+    carrier_.clear(), weight_.clear();
+    for (const Place<dim>& place : places)
+      for (int a = 0; a <= dim; ++a) carrier_.push_back(mesh_->master[mesh_->elements[place.element][a]]), weight_.push_back(std::max(place.l[a], 0.0));  // below 0 by rounding, on a face
+    return;
+  }
+  carrier_.resize(x.size()), weight_.resize(x.size() * splines);
   for (std::size_t i = 0; i < x.size(); ++i) {
-    if (shape_ == Shape::smooth) {
-      splines_at(x[i], &carrier_[i * splines], &weight_[i * splines]);
-      double met = 0.0;  // less than 1 where the mesh ends within a spline that no sample meets
-      for (int k = 0; k < splines; ++k) {
-        double& b = weight_[i * splines + k];
-        if (spline_weight_[carrier_[i * splines + k]] == 0.0) b = 0.0;
-        met += b;
+    const Splines at = splines_at(x[i]);
+    int first = at.first[dim - 1] - first_[dim - 1];
+    for (int axis = dim - 2; axis >= 0; --axis) first = first * count_[axis] + at.first[axis] - first_[axis];
+    carrier_[i] = first;
+    const auto along = Eigen::Map<const Eigen::Array4d>(at.along[0].data());
+    double* b = &weight_[i * splines];
+    Eigen::Array4d met = Eigen::Array4d::Zero();  // in all less than 1 where the mesh ends within a spline that no sample meets
+    for (int last = 0, k = 0; last < 4; ++last)
+      for (int middle = 0; middle < (dim == 3 ? 4 : 1); ++middle, k += 4) {
+        const double* inv_w = &inv_spline_weight_[first + (dim == 3 ? last * count_[1] + middle : last) * count_[0]];
+        double product = at.along[dim - 1][last];
+        if constexpr (dim == 3) product *= at.along[1][middle];
+        const Eigen::Array4d here = (Eigen::Map<const Eigen::Array4d>(inv_w) > 0).select(product * along, 0.0);
+        Eigen::Map<Eigen::Array4d>(b + k) = here;
+        met += here;
       }
-      for (int k = 0; k < splines; ++k) weight_[i * splines + k] /= met;
-      continue;
-    }
-    const auto& corners = mesh_->elements[places[i].element];
-    for (int a = 0; a <= dim; ++a) carrier_[i * per_grain_ + a] = mesh_->master[corners[a]], weight_[i * per_grain_ + a] = std::max(places[i].l[a], 0.0);  // below 0 by rounding, on a face
+    Eigen::Map<Eigen::Array<double, splines, 1>>(b + 0) *= 1 / met.sum();
   }
 }
 

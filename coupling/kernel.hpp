@@ -35,40 +35,66 @@ class Kernel {
   std::vector<T> to_carriers(const std::vector<T>& at_nodes, const T& zero) const;
   template <class T>
   T at_grain(int i, const std::vector<T>& at_carriers) const {
-    const int from = i * per_grain_;
-    T sum = weight_[from] * at_carriers[carrier_[from]];
-    for (int k = from + 1; k < from + per_grain_; ++k) sum += weight_[k] * at_carriers[carrier_[k]];
+    T sum = 0.0 * at_carriers[0];
+    each_weight(i, [&](int carrier, double weight) { sum += weight * at_carriers[carrier]; });
     return sum;
   }
   template <class T>
   void give(int i, const T& value, std::vector<T>& to_carriers) const {
-    for (int k = i * per_grain_; k < (i + 1) * per_grain_; ++k) to_carriers[carrier_[k]] += weight_[k] * value;
+    each_weight(i, [&](int carrier, double weight) { to_carriers[carrier] += weight * value; });
   }
   template <class T>
   std::vector<T> to_nodes(const std::vector<T>& of_carriers, const T& zero) const;  // sums, not yet over M_a
-  std::size_t carriers() const { return shape_ == Shape::hat ? masses_.size() : spline_weight_.size(); }
+  std::size_t carriers() const { return shape_ == Shape::hat ? masses_.size() : inv_spline_weight_.size(); }
 
  private:
   static constexpr int splines = dim == 2 ? 16 : 64;  // that are not 0 at a point
-  struct Sample {  // a point of the integral over y
-    std::array<int, dim + 1> node;
-    Barycentric<dim> l;
-    double volume;  // [m^dim]
-    std::array<int, splines> spline;
-    std::array<double, splines> b;
+  struct Splines {  // at a point: the first of four along each axis, on a grid without end, and their values
+    std::array<int, dim> first;
+    std::array<std::array<double, 4>, dim> along;
   };
-  void splines_at(const Vec<dim>& x, int* spline, double* b) const;
+  struct Seen {    // from a node
+    const Splines* sample;
+    std::array<int, dim> first;
+    double weight;  // N_a times its volume
+  };
+  Splines splines_at(const Vec<dim>& x) const;
+  int on_grid(int number, int axis) const { return on_grid_[axis][number - before_[axis]]; }
+  template <class Use>
+  void each_weight(int i, Use&& use) const {
+    if (shape_ == Shape::hat) {
+      for (int k = i * (dim + 1); k < (i + 1) * (dim + 1); ++k) use(carrier_[k], weight_[k]);
+      return;
+    }
+    const double* weight = &weight_[i * splines];
+    for (int last = 0; last < 4; ++last)
+      for (int middle = 0; middle < (dim == 3 ? 4 : 1); ++middle, weight += 4) {
+        const int from = carrier_[i] + (dim == 3 ? last * count_[1] + middle : last) * count_[0];
+        for (int m = 0; m < 4; ++m) use(from + m, weight[m]);
+      }
+  }
+  void add_row(int node, const std::vector<Vec<dim>>& nodes);
 
   std::shared_ptr<const Mesh<dim>> mesh_;
   Shape shape_;
   Vec<dim> spacing_, origin_;
   std::array<int, dim> periodic_;        // splines along a period, or 0
-  std::array<int, dim> first_, count_;   // of the grid that the mesh takes
+  // The grid that a grain in the mesh may meet, and beyond it by rounding: across a period splines are there twice, the second is an image.
+  std::array<int, dim> first_, count_;
+  std::vector<std::array<int, 2>> images_;     // and of what
+  std::array<std::vector<int>, dim> on_grid_;  // of numbers from before_ on, the place of what is no image
+  std::array<int, dim> before_;
   std::vector<fluid::QuadraturePoint<dim>> in_element_;  // the samples; empty: nodes
-  std::vector<Sample> samples_;
-  std::vector<double> masses_, spline_weight_;
-  int per_grain_;
-  std::vector<int> carrier_;
+  std::vector<std::vector<std::array<int, 2>>> around_;  // of each node, the elements there and which of their corners it is
+  std::vector<Splines> samples_;                         // of each element, or of each node
+  std::vector<double> volumes_, masses_;
+  std::vector<double> inv_spline_weight_;                // 1/w_g; 0 where no sample meets the spline
+  std::vector<Seen> seen_;
+  std::vector<double> window_;
+  // int N_a B_g, of each node a the splines g that it meets; nothing of images.
+  std::vector<int> row_start_, spline_;
+  std::vector<double> value_;
+  std::vector<int> carrier_;  // the first of each grain; for the hat, all
   std::vector<double> weight_;
 };
 
@@ -77,14 +103,13 @@ template <int dim>
 template <class T>
 std::vector<T> Kernel<dim>::to_carriers(const std::vector<T>& at_nodes, const T& zero) const {
   if (shape_ == Shape::hat) return at_nodes;
-  std::vector<T> sum(spline_weight_.size(), zero);
-  for (const Sample& s : samples_) {
-    T here = zero;
-    for (int a = 0; a <= dim; ++a) here += s.volume * s.l[a] * at_nodes[s.node[a]];
-    for (int k = 0; k < splines; ++k) sum[s.spline[k]] += s.b[k] * here;
+  std::vector<T> sum(carriers(), zero);
+  for (std::size_t a = 0; a < at_nodes.size(); ++a) {
+    const T here = at_nodes[a];
+    for (int k = row_start_[a]; k < row_start_[a + 1]; ++k) sum[spline_[k]] += value_[k] * here;
   }
-  for (std::size_t g = 0; g < sum.size(); ++g)
-    if (spline_weight_[g] > 0) sum[g] *= 1 / spline_weight_[g];
+  for (std::size_t g = 0; g < sum.size(); ++g) sum[g] *= inv_spline_weight_[g];
+  for (const auto& [image, spline] : images_) sum[image] = sum[spline];
   return sum;
 }
 
@@ -95,13 +120,13 @@ std::vector<T> Kernel<dim>::to_nodes(const std::vector<T>& of_carriers, const T&
   if (shape_ == Shape::hat) {
     for (std::size_t k = 0; k < sum.size(); ++k) sum[mesh_->master[k]] += of_carriers[k];
   } else {
-    std::vector<T> density(of_carriers.size(), zero);
-    for (std::size_t g = 0; g < density.size(); ++g)
-      if (spline_weight_[g] > 0) density[g] = (1 / spline_weight_[g]) * of_carriers[g];
-    for (const Sample& s : samples_) {
+    std::vector<T> density(of_carriers);
+    for (const auto& [image, spline] : images_) density[spline] += density[image];
+    for (std::size_t g = 0; g < density.size(); ++g) density[g] *= inv_spline_weight_[g];
+    for (std::size_t a = 0; a < sum.size(); ++a) {
       T here = zero;
-      for (int k = 0; k < splines; ++k) here += s.b[k] * density[s.spline[k]];
-      for (int a = 0; a <= dim; ++a) sum[s.node[a]] += s.volume * s.l[a] * here;
+      for (int k = row_start_[a]; k < row_start_[a + 1]; ++k) here += value_[k] * density[spline_[k]];
+      sum[a] = here;
     }
   }
   for (std::size_t k = 0; k < sum.size(); ++k) sum[k] = sum[mesh_->master[k]];

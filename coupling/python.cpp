@@ -26,7 +26,7 @@ Array to_numpy(const std::vector<T>& values) {
 }
 
 using fluid::one_of, fluid::Words;
-using Law = double (*)(const Suspension&);
+using Law = Eight (*)(const Suspensions&);
 constexpr Words<Law> laws = {{"di_felice", di_felice}, {"gidaspow", gidaspow}, {"beetstra", beetstra}};
 constexpr Words<Shape> kernels = {{"smooth", Shape::smooth}, {"hat", Shape::hat}};
 constexpr Words<Discs> kinds_of_discs = {{"spheres", Discs::spheres}, {"cylinders", Discs::cylinders}};

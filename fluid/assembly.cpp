@@ -67,14 +67,16 @@ std::vector<Vec<dim>> Fluid<dim>::subscales(const std::vector<double>& x, const 
   if (velocity_order() != 1) return {};
   std::vector<Vec<dim>> all(subscale_[0].size());
   for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
-    const ElementInput<dim, 1> in = input<1>(static_cast<int>(e));
     std::array<Vec<dim>, dim + 1> flux;
     std::array<double, dim + 1> p;
     for (int a = 0; a <= dim; ++a) {
       const int node = space_.node_of[e * (dim + 1) + a];
       flux[a] = Eigen::Map<const Vec<dim>>(&x[space_.first_dof[node]]), p[a] = x[space_.pressure_dof(node)];
     }
-    element_subscale<dim>(in, properties, time, flux, p, &all[e * quadrature<dim, 1>().size()]);
+    const std::size_t points = quadrature<dim, 1>().size();
+    if (residual_.empty()) element_subscale<dim>(input<1>(static_cast<int>(e)), properties, time, flux, p, &all[e * points]);
+    else
+      for (std::size_t q = e * points; q < (e + 1) * points; ++q) all[q] = residual_[q].subscale(flux, p);
   }
   return all;
 }
@@ -103,10 +105,15 @@ void Fluid<dim>::assemble(const TimeWeights& time, bool newton) {
   values_.assign(space_.column.size(), 0.0);
   b_.assign(space_.end - space_.begin, 0.0);
   ElementSystem<dim, order> system;
+  // Not where ranks assemble their own elements: all know all subscales, of the same code, to the last bit.
+  const bool keep = order == 1 && !newton && ranks() == 1;
+  const std::size_t points = quadrature<dim, order>().size();
+  residual_.resize(keep ? mesh_->elements.size() * points : 0);
   for (std::size_t local = 0; local < space_.elements.size(); ++local) {
-    ElementInput<dim, order> in = input<order>(space_.elements[local]);
+    const int element = space_.elements[local];
+    ElementInput<dim, order> in = input<order>(element);
     in.newton = newton;
-    element_system<dim, order>(in, properties, time, system);
+    element_system<dim, order>(in, properties, time, system, keep ? &residual_[element * points] : nullptr);
     scatter<order>(static_cast<int>(local), system);
   }
   for (int node = 0; node < space_.nodes(); ++node)

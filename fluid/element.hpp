@@ -3,7 +3,7 @@
 
 #include "meshes/mesh.hpp"
 
-#include <Eigen/LU>
+#include <Eigen/Geometry>
 
 #include <cmath>
 #include <type_traits>
@@ -62,19 +62,28 @@ struct Geometry {
 };
 
 template <int dim>
-Geometry<dim> geometry(const std::array<Vec<dim>, dim + 1>& x) {
-  Eigen::Matrix<double, dim, dim> j;
-  for (int a = 0; a < dim; ++a) j.col(a) = x[a + 1] - x[0];
+[[gnu::always_inline]] inline Geometry<dim> geometry(const std::array<Vec<dim>, dim + 1>& x) {
+  std::array<Vec<dim>, dim> across;  // what is normal to the other edges from x[0], times their area
+  double six_volumes;                // 2D: two
+  if constexpr (dim == 2) {
+    const Vec<dim> a = x[1] - x[0], b = x[2] - x[0];
+    across = {Vec<dim>(b.y(), -b.x()), Vec<dim>(-a.y(), a.x())};
+    six_volumes = a.dot(across[0]);
+  } else {
+    const Vec<dim> a = x[1] - x[0], b = x[2] - x[0], c = x[3] - x[0];
+    across = {b.cross(c), c.cross(a), a.cross(b)};
+    six_volumes = a.dot(across[0]);
+  }
   Geometry<dim> g;
-  const Eigen::Matrix<double, dim, dim> inverse = j.inverse();
-  g.volume = j.determinant() / (dim == 2 ? 2 : 6);
+  g.volume = six_volumes / (dim == 2 ? 2 : 6);
+  const double inverse = 1 / six_volumes;
   g.grad_l[0].setZero();
-  for (int a = 0; a < dim; ++a) g.grad_l[a + 1] = inverse.row(a), g.grad_l[0] -= g.grad_l[a + 1];
+  for (int k = 0; k < dim; ++k) g.grad_l[k + 1] = inverse * across[k], g.grad_l[0] -= g.grad_l[k + 1];
   return g;
 }
 
 template <int dim>
-Geometry<dim> geometry(const std::vector<Vec<dim>>& position, const std::array<int, dim + 1>& nodes) {
+[[gnu::always_inline]] inline Geometry<dim> geometry(const std::vector<Vec<dim>>& position, const std::array<int, dim + 1>& nodes) {
   std::array<Vec<dim>, dim + 1> x;
   for (int a = 0; a <= dim; ++a) x[a] = position[nodes[a]];
   return geometry<dim>(x);

@@ -77,7 +77,7 @@ struct ElementSystem {
 
 // 4/h^2 for a regular simplex of edge h: 2 |u|/sqrt(u . m u) is the length of the element along u [1/m^2].
 template <int dim>
-Mat<dim> metric(const Geometry<dim>& g) {
+[[gnu::always_inline]] inline Mat<dim> metric(const Geometry<dim>& g) {
   Mat<dim> m = Mat<dim>::Zero();
   for (const Vec<dim>& grad : g.grad_l) m += 2.0 * grad * grad.transpose();
   return m;
@@ -101,7 +101,7 @@ struct Stabilisation {
   double tau, bulk;
 };
 template <int dim, int order>
-Stabilisation<dim> stabilisation(const Mat<dim>& m, const Properties<dim>& fluid, const Vec<dim>& u, double rate, double inertia_over_eps, double beta_over_eps, double eps_jump) {
+[[gnu::always_inline]] inline Stabilisation<dim> stabilisation(const Mat<dim>& m, const Properties<dim>& fluid, const Vec<dim>& u, double rate, double inertia_over_eps, double beta_over_eps, double eps_jump) {
   constexpr double growth = order == 1 ? 40.0 : dim == 2 ? 200.0 : 0.0;
   const double advective = fluid.density * fluid.density * u.dot(m * u);
   const double viscous = 9.0 * fluid.viscosity * fluid.viscosity * m.squaredNorm();
@@ -127,7 +127,7 @@ struct AtPoint {
   Vec<dim> beside;                       // what only the subscales' residual has, and no unknown [N/m^3]
   Stabilisation<dim> stab;
 
-  AtPoint(const ElementInput<dim, order>& in, const Geometry<dim>& g, const Properties<dim>& fluid, const TimeWeights& time, int q) {
+  [[gnu::always_inline]] AtPoint(const ElementInput<dim, order>& in, const Geometry<dim>& g, const Mat<dim>& m, const Properties<dim>& fluid, const TimeWeights& time, int q) {
     const auto& point = quadrature<dim, order>()[q];
     const double rho = fluid.density;
     shape = shapes<dim, order>(point.l);
@@ -167,7 +167,6 @@ struct AtPoint {
     for (int t = 0; t < 2; ++t)
       if (in.subscale[t]) beside += rho * time[t + 1] * in.subscale[t][q];
     if (in.subscale[0] && reaction.inertia > 0) beside -= reaction.inertia * inv_eps * in.subscale[0][q];
-    const Mat<dim> m = metric<dim>(g);
     eps_curvature.setZero();
     if constexpr (order == 1) {
       for (int a = 0; a < n; ++a) eps_curvature += 0.5 * (in.eps_slope[a] * grad[a].transpose() + grad[a] * in.eps_slope[a].transpose());
@@ -186,7 +185,7 @@ struct AtPoint {
   // What the viscous force -eps div(2 eta D(u)) is per unit of unknown b, column j by U_j: second derivatives of U/eps, U linear. Those of eps count as much
   // as its slope squared; elements do not have them, but their neighbours' slopes do, as K. Jansen, S. Collis, C. Whiting and F. Shakib have it for
   // velocities, CMAME 174 (1999). Order 1 only.
-  Mat<dim> viscous(int b, double eta) const {
+  [[gnu::always_inline]] Mat<dim> viscous(int b, double eta) const {
     static_assert(order == 1);
     const double inv_eps = 1.0 / eps;
     const Mat<dim> cross = grad[b] * grad_eps.transpose();
@@ -195,16 +194,32 @@ struct AtPoint {
   }
 };
 
+// The residual of the momentum at a quadrature point as what is found makes it, and what that makes of the subscale; order 1.
+template <int dim>
+struct Residual {
+  double tau, drives;
+  Vec<dim> rest;
+  std::array<Vec<dim>, dim + 1> grad;
+  std::array<Mat<dim>, dim + 1> by_flux;
+  Vec<dim> subscale(const std::array<Vec<dim>, dim + 1>& flux, const std::array<double, dim + 1>& p) const {
+    Vec<dim> residual = rest;
+    for (int b = 0; b <= dim; ++b) residual += drives * p[b] * grad[b] + by_flux[b] * flux[b];
+    return -tau * residual;
+  }
+};
+
+// residual: at each quadrature point, or none is kept; order 1, without Newton's derivative.
 template <int dim, int order>
-void element_system(const ElementInput<dim, order>& in, const Properties<dim>& fluid, const TimeWeights& time, ElementSystem<dim, order>& out) {
+void element_system(const ElementInput<dim, order>& in, const Properties<dim>& fluid, const TimeWeights& time, ElementSystem<dim, order>& out, Residual<dim>* residual = nullptr) {
   constexpr int n = shape_count<dim, order>;
   const Geometry<dim> g = geometry<dim>(in.x);
+  const Mat<dim> m = metric<dim>(g);
   const double rho = fluid.density, eta = fluid.viscosity;
   out.a.setZero(), out.b.setZero();
   const auto& rule = quadrature<dim, order>();
   for (std::size_t q = 0; q < rule.size(); ++q) {
     const double weight = rule[q].weight * g.volume;
-    const AtPoint<dim, order> at(in, g, fluid, time, static_cast<int>(q));
+    const AtPoint<dim, order> at(in, g, m, fluid, time, static_cast<int>(q));
     const auto& shape = at.shape;
     const auto& grad = at.grad;
     const Stabilisation<dim>& stab = at.stab;
@@ -250,6 +265,7 @@ void element_system(const ElementInput<dim, order>& in, const Properties<dim>& f
         strong[b] = viscous[b] + at.inertia[b] * Mat<dim>::Identity();
         if (in.newton) strong[b] += rho * shape[b] * at.slope;
       }
+      if (residual) residual[q] = {stab.tau, at.drives, at.beside - at.load, grad, strong};
       for (int a = 0; a < n; ++a) {
         const double along = weight * stab.tau * rho * at.relative.dot(grad[a]);
         const Vec<dim> test = weight * stab.tau * grad[a];  // PSPG: continuity holds for U less tau times the residual
@@ -271,11 +287,12 @@ void element_system(const ElementInput<dim, order>& in, const Properties<dim>& f
 template <int dim>
 void element_subscale(const ElementInput<dim, 1>& in, const Properties<dim>& fluid, const TimeWeights& time, const std::array<Vec<dim>, dim + 1>& found, const std::array<double, dim + 1>& p, Vec<dim>* out) {
   const Geometry<dim> g = geometry<dim>(in.x);
+  const Mat<dim> m = metric<dim>(g);
   for (std::size_t q = 0; q < quadrature<dim, 1>().size(); ++q) {
-    const AtPoint<dim, 1> at(in, g, fluid, time, static_cast<int>(q));
-    Vec<dim> residual = at.beside - at.load;
-    for (int b = 0; b <= dim; ++b) residual += at.drives * p[b] * at.grad[b] + at.inertia[b] * found[b] + at.viscous(b, fluid.viscosity) * found[b];
-    out[q] = -at.stab.tau * residual;
+    const AtPoint<dim, 1> at(in, g, m, fluid, time, static_cast<int>(q));
+    Residual<dim> residual{at.stab.tau, at.drives, at.beside - at.load, at.grad, {}};
+    for (int b = 0; b <= dim; ++b) residual.by_flux[b] = at.viscous(b, fluid.viscosity) + at.inertia[b] * Mat<dim>::Identity();
+    out[q] = residual.subscale(found, p);
   }
 }
 

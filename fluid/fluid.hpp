@@ -214,6 +214,17 @@ class Fluid {
     double eps;
     Mat<dim> slope;    // d u_i/d x_j [1/s]
   };
+  template <int order>
+  struct AtNodes {  // of an element
+    std::array<double, shape_count<dim, order>> eps;
+    std::array<Vec<dim>, shape_count<dim, order>> flux;
+  };
+  template <int order>
+  AtNodes<order> at_nodes(int element) const;
+  template <int order>
+  InElement flow_at(const AtNodes<order>& nodes, const Barycentric<dim>& l, const Geometry<dim>& g) const;
+  template <int order>
+  Vec<dim> velocity_at(int element, const Barycentric<dim>& l, int steps_ago) const;
   InElement flow_in(int element, const Barycentric<dim>& l, const Geometry<dim>& g) const;
   double pressure_in(int element, const Barycentric<dim>& l, int steps_ago = 0) const;
   Vec<dim> pressure_slope(int element, const Geometry<dim>& g, int steps_ago = 0) const;
@@ -245,6 +256,7 @@ class Fluid {
   std::array<std::vector<double>, 2> x_;           // unknowns, Cartesian, after the last step and the one before
   std::vector<Vec<dim>> eps_slope_;                // order 1: grad eps at the nodes, for the coming step [1/m]
   std::array<std::vector<Vec<dim>>, 2> subscale_;  // order 1: at quadrature points, after the last step and the one before [m/s]
+  std::vector<Residual<dim>> residual_;            // order 1: of the last system at quadrature points; empty where subscales() has to find it
   std::vector<Vec<dim>> advance_;                  // with grains_follow: dt a of the last step at quadrature points [m]
   std::vector<double> guess_;                      // that advects
   std::array<double, 3> pore_volume_{};            // int eps: now, and one and two steps ago [m^dim]

@@ -145,18 +145,22 @@ auto Fluid<dim>::error(const VectorField<dim>& velocity, const ScalarField<dim>&
 }
 
 template <int dim>
-Vec<dim> Fluid<dim>::velocity_in(int element, const Barycentric<dim>& l, int steps_ago) const {
+template <int order>
+[[gnu::always_inline]] inline Vec<dim> Fluid<dim>::velocity_at(int element, const Barycentric<dim>& l, int steps_ago) const {
   double eps = 0.0;
   Vec<dim> flux = Vec<dim>::Zero();
-  with_order(velocity_order(), [&]<int order>(std::integral_constant<int, order>) {
-    const auto shape = shapes<dim, order>(l);
-    for (int a = 0; a < shape_count<dim, order>; ++a) {
-      const int node = space_.node_of[element * space_.per_element + a];
-      eps += shape[a] * eps_[1 + steps_ago][node];
-      flux += shape[a] * Eigen::Map<const Vec<dim>>(&x_[steps_ago][space_.first_dof[node]]);
-    }
-  });
+  const auto shape = shapes<dim, order>(l);
+  const int* node = &space_.node_of[element * shape_count<dim, order>];
+  for (int a = 0; a < shape_count<dim, order>; ++a) {
+    eps += shape[a] * eps_[1 + steps_ago][node[a]];
+    flux += shape[a] * Eigen::Map<const Vec<dim>>(&x_[steps_ago][space_.first_dof[node[a]]]);
+  }
   return flux / eps;
+}
+
+template <int dim>
+Vec<dim> Fluid<dim>::velocity_in(int element, const Barycentric<dim>& l, int steps_ago) const {
+  return velocity_order() == 1 ? velocity_at<1>(element, l, steps_ago) : velocity_at<2>(element, l, steps_ago);
 }
 
 template <int dim>
@@ -212,23 +216,35 @@ double Fluid<dim>::yield_at(const std::array<int, dim + 1>& corners, const Baryc
 }
 
 template <int dim>
-auto Fluid<dim>::flow_in(int element, const Barycentric<dim>& l, const Geometry<dim>& g) const -> InElement {
+template <int order>
+[[gnu::always_inline]] inline auto Fluid<dim>::flow_at(const AtNodes<order>& nodes, const Barycentric<dim>& l, const Geometry<dim>& g) const -> InElement {
   double eps = 0.0;
   Vec<dim> flux = Vec<dim>::Zero(), grad_eps = Vec<dim>::Zero();
   Mat<dim> slope = Mat<dim>::Zero();
-  with_order(velocity_order(), [&]<int order>(std::integral_constant<int, order>) {
-    const auto shape = shapes<dim, order>(l);
-    const auto grad = shape_gradients<dim, order>(l, g.grad_l);
-    for (int a = 0; a < shape_count<dim, order>; ++a) {
-      const int node = space_.node_of[element * space_.per_element + a];
-      const Vec<dim> here = Eigen::Map<const Vec<dim>>(&x_[0][space_.first_dof[node]]);
-      eps += shape[a] * eps_[1][node], grad_eps += eps_[1][node] * grad[a];
-      flux += shape[a] * here, slope += here * grad[a].transpose();
-    }
-  });
-  const Vec<dim> u = flux / eps;
-  slope = (slope - u * grad_eps.transpose()) / eps;
+  const auto shape = shapes<dim, order>(l);
+  const auto grad = shape_gradients<dim, order>(l, g.grad_l);
+  for (int a = 0; a < shape_count<dim, order>; ++a) {
+    eps += shape[a] * nodes.eps[a], grad_eps += nodes.eps[a] * grad[a];
+    flux += shape[a] * nodes.flux[a], slope += nodes.flux[a] * grad[a].transpose();
+  }
+  const double inv_eps = 1 / eps;
+  const Vec<dim> u = inv_eps * flux;
+  slope = inv_eps * (slope - u * grad_eps.transpose());
   return {u, properties.viscosity * (slope + slope.transpose()), eps, slope};
+}
+
+template <int dim>
+template <int order>
+[[gnu::always_inline]] inline auto Fluid<dim>::at_nodes(int element) const -> AtNodes<order> {
+  AtNodes<order> at;
+  const int* node = &space_.node_of[element * shape_count<dim, order>];
+  for (int a = 0; a < shape_count<dim, order>; ++a) at.eps[a] = eps_[1][node[a]], at.flux[a] = Eigen::Map<const Vec<dim>>(&x_[0][space_.first_dof[node[a]]]);
+  return at;
+}
+
+template <int dim>
+auto Fluid<dim>::flow_in(int element, const Barycentric<dim>& l, const Geometry<dim>& g) const -> InElement {
+  return velocity_order() == 1 ? flow_at<1>(at_nodes<1>(element), l, g) : flow_at<2>(at_nodes<2>(element), l, g);
 }
 
 template <int dim>
@@ -239,20 +255,24 @@ auto Fluid<dim>::projected(bool convection) const -> Projected {
     for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
       const auto& corners = mesh_->elements[e];
       const Geometry<dim> g = geometry<dim>(position_, corners);
-      const Vec<dim> grad_p = pressure_slope(static_cast<int>(e), g);
+      std::array<Vec<dim>, dim + 1> velocity;
+      velocity.fill(Vec<dim>::Zero());
+      Mat<dim> stress = Mat<dim>::Zero();
+      const auto nodes = at_nodes<order>(static_cast<int>(e));
       for (const auto& point : quadrature<dim, order>()) {
-        const InElement there = flow_in(static_cast<int>(e), point.l, g);
+        const InElement there = flow_at<order>(nodes, point.l, g);
         const double weight = point.weight * g.volume;
-        for (int a = 0; a <= dim; ++a) {
-          const int node = space_.vertex[corners[a]];
-          sum.velocity[node] += weight * point.l[a] * there.u;
-          sum.pressure_gradient[node] += weight * point.l[a] * grad_p;
-          sum.viscous_force[node] -= weight * there.stress * g.grad_l[a];
-        }
+        for (int a = 0; a <= dim; ++a) velocity[a] += weight * point.l[a] * there.u;
+        stress += weight * there.stress;
         if (!convection) continue;
         Vec<dim> relative = there.u;
         for (int a = 0; a <= dim; ++a) relative -= point.l[a] * mesh_velocity_[corners[a]];
         for (int a = 0; a <= dim; ++a) sum.convection[space_.vertex[corners[a]]] += weight * point.l[a] * there.slope * relative;
+      }
+      const Vec<dim> grad_p = g.volume / (dim + 1) * pressure_slope(static_cast<int>(e), g);
+      for (int a = 0; a <= dim; ++a) {
+        const int node = space_.vertex[corners[a]];
+        sum.velocity[node] += velocity[a], sum.pressure_gradient[node] += grad_p, sum.viscous_force[node] -= stress * g.grad_l[a];
       }
     }
     for (std::size_t f = 0; f < mesh_->facets.size(); ++f) {
@@ -302,8 +322,8 @@ Vec<dim> Fluid<dim>::reaction_force() const {
       if (reaction_on_change) grad_p -= pressure_slope(static_cast<int>(e), g, 1);
       for (std::size_t q = 0; q < rule.size(); ++q) {
         const Reaction<dim>& r = reaction_[e * rule.size() + q];
-        const Vec<dim> u = velocity_in(static_cast<int>(e), rule[q].l), change = u - velocity_in(static_cast<int>(e), rule[q].l, 1);
-        sum += rule[q].weight * g.volume * (r.beta_target + r.force - r.beta * (reaction_on_change ? change : u) - r.yield * grad_p - r.inertia * change);
+          const Vec<dim> u = velocity_at<order>(static_cast<int>(e), rule[q].l, 0), change = u - velocity_at<order>(static_cast<int>(e), rule[q].l, 1);
+          sum += rule[q].weight * g.volume * (r.beta_target + r.force - r.beta * (reaction_on_change ? change : u) - r.yield * grad_p - r.inertia * change);
       }
     }
   });
