@@ -43,7 +43,7 @@ Coupling<dim>::Coupling(Simulation<dim>& grains, fluid::Fluid<dim>& fluid, Setti
   for (const Vec<dim>& x : mesh_->nodes) low = low.cwiseMin(x), high = high.cwiseMax(x);
   for (std::size_t k = 0; k < mesh_->nodes.size(); ++k) shift = shift.cwiseMax((mesh_->nodes[k] - mesh_->nodes[mesh_->master[k]]).cwiseAbs());
   for (int k = 0; k < dim; ++k) {
-    if ((period[k] > 0) != (shift[k] > 0) || std::abs(period[k] - shift[k]) > 1e-9 * period[k])
+    if ((period[k] > 0) != (shift[k] > 1e-9 * (high[k] - low[k])) || std::abs(period[k] - shift[k]) > 1e-9 * period[k])
       fail("Coupling: the grains' period along axis {} is {} m, that of the mesh {} m (0: not periodic); they must be the same", k, period[k], shift[k]);
     if (period[k] > 0 && std::abs(high[k] - low[k] - period[k]) > 1e-9 * period[k])
       fail("Coupling: the mesh must extend over one period along axis {}, {} m, but does over {}", k, period[k], high[k] - low[k]);
@@ -254,21 +254,15 @@ void Coupling<dim>::answer_as_expected(double dt) {
   }
 }
 
-// Of grains that contacts moved, about what they did: v is their velocity as drag felt it, mean over the step.
+// About what the last pass did: in the same flow the fluid would give what grains got.
 template <int dim>
 void Coupling<dim>::answer_as_last(double dt) {
   for (std::size_t i = 0; i < x_.size(); ++i) {
-    if (free_[i]) continue;
-    Vec<dim> drag = drag_force_[i];
-    if (settings.added_mass > 0) {
-      drag -= added_impulse_[i];
-      answer_[i].inertia = added_mass_of(static_cast<int>(i)) / dt;
-      answer_[i].given = answer_[i].inertia * (u_mean_[i] - u_mean_before_[i]) - added_impulse_[i] / dt, answer_[i].grad_p = grad_p_[i];
-    }
-    if (drag_[i].gamma == 0) continue;
-    answer_[i].beta = drag_[i].gamma, answer_[i].grad_p = grad_p_[i];
-    if (settings.added_mass == 0) answer_[i].given.setZero();
-    answer_[i].v = target_[i] - drag / (dt * drag_[i].gamma);
+    Answer& answer = answer_[i];
+    if (!free_[i]) answer.beta = drag_[i].gamma, answer.inertia = added_mass_of(static_cast<int>(i)) / dt;
+    const Vec<dim> change = u_mean_[i] - u_mean_before_[i];
+    answer.given = answer.beta * (u_before_[i] + change - drag_[i].shift - answer.v) + answer.inertia * change - drag_force_[i] / dt;
+    answer.grad_p = grad_p_[i];
   }
 }
 

@@ -66,7 +66,7 @@ def bed_error(size, kernel):
     sim.add(x * d, d / 2, density=flags.density)
     both, reports = packed_bed.couple(flags, sim, flow, False), []
     try:
-        packed_bed.through(both, sim, False, packed_bed.time_step(flags, sim, eps), flags.stiffness, lambda: packed_bed.superficial_velocity(flow, 0), reports)
+        packed_bed.through(both, packed_bed.time_step(flags, sim, eps), lambda: packed_bed.superficial_velocity(flow, 0), reports)
     except (ValueError, fluid.NotConverged):
         return None, None, None
     law = packed_bed.gradient(flags, eps, packed_bed.superficial_velocity(flow, 0))

@@ -313,6 +313,26 @@ def test_grains_leave_through_an_outlet_and_are_counted(added_mass):
     assert removed == both.removed == 2 and sim.count == 1
 
 
+def test_passes_bring_the_phases_to_agree():
+    """In a block that settles on a floor, grains free and in contact; each pass gains a digit or more."""
+    x = lattice((9, 12), (12 * D, 15 * D), (-6 * D, 0.0), jitter=0.6)
+    mesh = meshes.box([12 * D, 24 * D], [4, 8], origin=[-6 * D, 0.0])
+    flow = fluid.Fluid(mesh, density=WATER, viscosity=VISCOSITY, gravity=(0, -9.81))
+    for boundary in mesh.boundary_names:
+        flow.wall(boundary)
+    flow.mean_pressure(0.0)
+    sim = simulation(2, x, gravity=(0, -9.81))
+    sim.walls(mesh, ["left", "right", "bottom", "top"])
+    sim.tolerance, sim.accept_unconverged, sim.max_sweeps = 1e-8, True, 3000
+    both = coupling.Coupling(sim, flow, kernel_radius=1.5 * D)
+    for _ in range(5):
+        assert 1e-3 < both.step(1e-3).disagreement < 1
+    both.tolerance, both.max_passes = 1e-9, 8
+    for _ in range(5):
+        report = both.step(1e-3)
+        assert report.disagreement < 1e-9 and 2 < report.passes < 8 and report.momentum_error < 1e-12
+
+
 def test_what_cannot_be_is_named():
     mesh = meshes.box([10 * D, 10 * D], [4, 4])
     flow = fluid.Fluid(mesh, density=WATER, viscosity=VISCOSITY)
