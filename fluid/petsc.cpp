@@ -20,13 +20,6 @@ void check(PetscErrorCode error, const char* what) {
 }
 #define PETSC(call) check(call, #call)
 
-// What the user has set stays.
-void set_option(const std::string& name, const std::string& value) {
-  PetscBool set = PETSC_FALSE;
-  PETSC(PetscOptionsHasName(nullptr, nullptr, ("-" + name).c_str(), &set));
-  if (!set) PETSC(PetscOptionsSetValue(nullptr, ("-" + name).c_str(), value.c_str()));
-}
-
 }  // namespace
 
 void start_petsc() {
@@ -83,7 +76,6 @@ struct LinearSolver::State {
   std::vector<int> row_start, block_column;
   int begin = 0, block = 1;
   bool keep_factors = false;
-  int with_new_factors = 0;  // iterations
   double scale = 0.0;  // first residual of recent systems
   std::vector<double> history = std::vector<double>(1);
   ~State() {
@@ -140,12 +132,6 @@ LinearSolver::LinearSolver(int begin, int end, int size, const std::vector<int>&
     PETSC(MatMumpsSetIcntl(factors, 14, 200));
   } else if (settings.method == Method::ilu) {
     PETSC(PCSetType(pc, ranks() == 1 ? PCILU : PCBJACOBI));
-    if (settings.levels > 0) {
-      set_option(prefix + "sub_pc_factor_levels", std::to_string(settings.levels));
-      set_option(prefix + "sub_pc_factor_mat_ordering_type", MATORDERINGRCM);
-      PETSC(PCFactorSetLevels(pc, settings.levels));  // nothing where ranks have their blocks
-      PETSC(PCFactorSetMatOrderingType(pc, MATORDERINGRCM));
-    }
   } else {
     PETSC(KSPSetType(s_->ksp, KSPFGMRES));
     PETSC(PCSetType(pc, PCFIELDSPLIT));
@@ -159,8 +145,13 @@ LinearSolver::LinearSolver(int begin, int end, int size, const std::vector<int>&
     PETSC(PCFieldSplitSetType(pc, PC_COMPOSITE_SCHUR));
     PETSC(PCFieldSplitSetSchurFactType(pc, PC_FIELDSPLIT_SCHUR_FACT_UPPER));
     PETSC(PCFieldSplitSetSchurPre(pc, PC_FIELDSPLIT_SCHUR_PRE_SELFP, nullptr));
-    for (const auto& [name, value] : {std::pair{"fieldsplit_u_ksp_type", "preonly"}, {"fieldsplit_u_pc_type", ranks() == 1 ? "ilu" : "bjacobi"}, {"fieldsplit_p_ksp_type", "preonly"}, {"fieldsplit_p_pc_type", "hypre"}})
-      set_option(prefix + name, value);
+    // Options that the user has set stay.
+    for (const auto& [name, value] : {std::pair{"fieldsplit_u_ksp_type", "preonly"}, {"fieldsplit_u_pc_type", ranks() == 1 ? "ilu" : "bjacobi"}, {"fieldsplit_p_ksp_type", "preonly"}, {"fieldsplit_p_pc_type", "hypre"}}) {
+      PetscBool set = PETSC_FALSE;
+      const std::string option = "-" + prefix + name;
+      PETSC(PetscOptionsHasName(nullptr, nullptr, option.c_str(), &set));
+      if (!set) PETSC(PetscOptionsSetValue(nullptr, option.c_str(), value));
+    }
   }
   PETSC(KSPSetResidualHistory(s_->ksp, s_->history.data(), 1, PETSC_TRUE));
   PETSC(KSPSetFromOptions(s_->ksp));
@@ -194,9 +185,8 @@ LinearReport LinearSolver::solve(std::span<const double> values, std::span<const
   PETSC(KSPSetOperators(s_->ksp, s_->matrix, s_->matrix));
   // Newton's matrices change more from one to the next; and what it goes on to correct may be far below what it began with.
   const bool newton = tolerance > s_->settings.tolerance;
-  int most = newton ? s_->settings.most_with_old_factors / 2 : s_->settings.most_with_old_factors;
+  const int most = newton ? s_->settings.most_with_old_factors / 2 : s_->settings.most_with_old_factors;
   for (bool old = s_->keep_factors;; old = false) {
-    if (s_->settings.method == Method::ilu) most = s_->with_new_factors + s_->with_new_factors / 4;
     PETSC(KSPSetReusePreconditioner(s_->ksp, old ? PETSC_TRUE : PETSC_FALSE));
     // With old factors no more than it costs to make new ones is tried.
     PETSC(KSPSetTolerances(s_->ksp, std::max(tolerance, s_->settings.tolerance), std::max((newton ? 1e-3 : 1.0) * s_->settings.tolerance * s_->scale, 1e-300), PETSC_DEFAULT, old ? 2 * most : s_->settings.max_iterations));
@@ -216,8 +206,7 @@ LinearReport LinearSolver::solve(std::span<const double> values, std::span<const
     report.converged = reason > 0;
     report.residual = residual;
     report.reason = KSPConvergedReasons[reason];
-    if (!old) s_->with_new_factors = iterations;
-    s_->keep_factors = report.converged && (s_->settings.method == Method::direct ? iterations <= most : s_->settings.method == Method::ilu && (!old || iterations <= most));
+    s_->keep_factors = report.converged && s_->settings.method == Method::direct && iterations <= most;
     if (report.converged || !old) break;
   }
   const PetscScalar* from;

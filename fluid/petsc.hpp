@@ -22,7 +22,7 @@ void share(std::vector<double>& x, const std::vector<int>& first);
 
 enum class Method {
   direct,    // MUMPS; its factors serve on as a preconditioner of GMRES while few iterations are enough
-  ilu,       // GMRES with incomplete factors of each rank's blocks of a node's unknowns, which serve on as well
+  ilu,       // GMRES with ILU(0) of each rank's blocks of a node's unknowns
   fieldsplit,  // flexible GMRES; velocity by ILU(0), pressure by multigrid on A_pu diag(A_uu)^-1 A_up (SELFP)
 };
 
@@ -30,8 +30,7 @@ struct LinearSettings {
   Method method = Method::direct;
   double tolerance = 1e-11;     // on the residual, preconditioned, relative to the first one of this system or of recent ones [-]
   int max_iterations = 1000;
-  int most_with_old_factors = 16;  // iterations: more, and the next matrix is factorised anew. With ilu, a quarter more than new ones took
-  int levels = 0;               // of fill, of ilu
+  int most_with_old_factors = 16;  // iterations: more, and the next matrix is factorised anew
 };
 
 struct LinearReport {
