@@ -1,5 +1,7 @@
 """Examples of grains in a fluid: their keys, their pictures, and how near they come to the drag law."""
 
+import json
+
 import pytest
 
 from run_examples import go, results
@@ -69,6 +71,19 @@ def test_a_block_settles_in_a_closed_box_and_none_of_it_gets_out(tmp_path, dim):
     assert height[-1] < 0.6 * height[0] and min(height) > 0
     assert found["front_speed"] > found["front_speed_law"]  # a block falls as one, faster than its grains do through it
     assert found["momentum_error"] < 1e-8 and found["volume_error"] < 1e-7 and found["void_fraction_min"] > 0.1
+
+
+def test_errors_of_the_coupling_are_charted(tmp_path):
+    done = go("accuracy_coupling", tmp_path, "--quick")
+    assert done.returncode == 0, done.stderr
+    found = json.loads((tmp_path / "results.json").read_text())
+    wake = list(zip(found["wake_undisturbed"], found["wake_error"]))
+    assert all(abs(error) < 0.03 if undisturbed else error > 0.04 for undisturbed, error in wake) and len(wake) == 8
+    hat, smooth = ([abs(e) for e, kernel in zip(found["beds_error"], found["beds_kernel_over_d"]) if (kernel == 0) == is_hat] for is_hat in (True, False))
+    assert max(smooth) < 1e-3 < max(hat)
+    slow, fast = zip(*zip(found["crossing_jump"][::2], found["crossing_jump"][1::2]))  # dt and half of it, of the hat and the smooth kernel
+    assert fast[0] > slow[0] and fast[1] == pytest.approx(slow[1] / 2, rel=0.02)
+    assert all((tmp_path / f"{picture}.png").stat().st_size > 10000 for picture in ("wake", "beds", "crossing"))
 
 
 @pytest.mark.parametrize("name, args, says", [("packed_bed", ("--mesh-over-d", 0), "must be > 0"), ("sedimentation", ("--phi", 0.9), "at most 0.75"), ("terminal_velocity", ("--density", 1000), "does not fall"),
