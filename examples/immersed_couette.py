@@ -23,8 +23,9 @@ results.json, SI, null where undefined: all keys of the dry example, and, means 
     fluid_shear_stress      mean of -eta (du_x/dy + du_y/dx) over the cell [Pa], negative as tau is
     mean_drag               |drag| of a grain, mean over grains [N/m]
     plate_shear_traction    force of grains and fluid on the plates along x over their area, the mean of both [Pa]
-    shear_stress            of contacts, grains' motion and fluid, mean over y [Pa]
-    shear_stress_variation  largest of |its mean over time at a height - the mean|, relative, two diameters and more from the plates [-]
+    shear_stress            of contacts, grains' motion and fluid, mean over the same slabs as below [Pa]
+    shear_stress_variation  largest of |its mean over time in a slab - the mean|, relative, in slabs beyond the kernel's reach, 3.2 R0, from the plates: nearer
+                            to them drag moves momentum from grains to fluid over distances that neither's stress knows [-]
     drained_volume_error    |volume that the plates let out - what the cell lost| over the largest change of its volume, whole run [-]
     momentum_error volume_error   largest of all steps, see quicksand.coupling [-]
     carried_impulse         mean; what the fluid gives back a step late, over what was exchanged [-]
@@ -169,10 +170,11 @@ def immersed_results(results, scene, run, stresses, flags):
     volume = flags.width * height
     stress = variation = None
     if parts is not None:
-        y = (np.arange(stresses.slabs) + 0.5) / stresses.slabs * results["h"]
-        inside = (y >= 4 * RADIUS) & (y <= results["h"] - 4 * RADIUS)
-        total = parts.sum(axis=0)[inside]
-        stress, variation = total.mean(), np.abs(total / total.mean() - 1).max()
+        ends = np.arange(stresses.slabs + 1) / stresses.slabs * results["h"]
+        reach = 3.2 * flags.kernel_radius
+        total = parts.sum(axis=0)[(ends[:-1] >= reach) & (ends[1:] <= results["h"] - reach)]
+        if total.size:
+            stress, variation = total.mean(), np.abs(total / total.mean() - 1).max()
     spent = {name: run[f"{name}_time"].sum() for name in SHARES}
     return results | {
         "viscous_number": flags.viscosity * rate / pressure if known and pressure > 0 else None,

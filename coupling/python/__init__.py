@@ -29,7 +29,7 @@ def Coupling(grains, fluid, *, kernel="smooth", kernel_radius=None, drag="di_fel
         published 2D computations with MigFlow, gamma 4/(pi d) per metre of depth at the void fraction of the discs.
     undisturbed : bool
         3D: drag by the flow as it would be without the grain, whose own averaged wake is told in closed form (steady; of unbounded flow, slowed by the
-        drag of grains around; about as long along all axes as elements are). A single grain then falls as the law says, not 5 to 25 % faster; in beds of
+        drag of grains around; about as long along all axes as elements are). A single grain then falls as the law says, not 5 to 22 % faster (slow flow); in beds of
         solids above 0.1 it changes next to nothing.
     added_mass : float
         C_m [-]: a grain feels m_a (Du/Dt - dv/dt) besides, m_a = C_m times the fluid that it displaces, the fluid feels the opposite (Auton, Hunt and
