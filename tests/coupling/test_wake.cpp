@@ -19,7 +19,7 @@ TEST(Wake, IsScreenedByTheDragOfOthers) {
 
 // int t^2 (1 - mu^2)/(t^2 + r^2 mu^2) exp(-t^2) dt dmu over 2 sqrt(pi)/3, r = rho W s/eta, by scipy.integrate.quad
 TEST(Wake, IsLeftBehindInFastFlow) {
-  for (const auto [r, expected] : {std::pair{0.1, 0.9373223}, {1.0, 0.5902767}, {10.0, 0.1191887}, {1000.0, 0.001327790}})
+  for (const auto& [r, expected] : {std::pair{0.1, 0.9373223}, {1.0, 0.5902767}, {10.0, 0.1191887}, {1000.0, 0.001327790}})
     EXPECT_NEAR(own_wake(s, viscosity, density, 0.0, r * viscosity / (density * s)) / alone / expected, 1.0, 1e-4) << r;
 }
 
