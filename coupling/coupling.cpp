@@ -48,6 +48,7 @@ Coupling<dim>::Coupling(Simulation<dim>& grains, fluid::Fluid<dim>& fluid, Setti
     if (period[k] > 0 && std::abs(high[k] - low[k] - period[k]) > 1e-9 * period[k])
       fail("Coupling: the mesh must extend over one period along axis {}, {} m, but does over {}", k, period[k], high[k] - low[k]);
   }
+  settings.undisturbed &= settings.fluid_moves;  // of a fluid that feels no grain the flow is undisturbed
   if (settings.undisturbed && dim == 2) fail("Coupling: undisturbed is of spheres: the wake of a disc in slow flow is as wide as the domain");
   if (settings.fluid_moves) {
     fluid_.settings.scheme = fluid::Scheme::backward_euler;
@@ -398,26 +399,27 @@ template <int dim>
 void Coupling<dim>::move_grains(double dt, Report<dim>& report) {
   const int n = static_cast<int>(x_.size());
   std::vector<double> gamma(n);
-  target_.resize(n), drag_force_.resize(n);
-  for (int i = 0; i < n; ++i) gamma[i] = drag_[i].gamma, target_[i] = u_[i] - drag_[i].shift;
+  std::vector<Vec<dim>> target(n);
+  drag_force_.resize(n);
+  for (int i = 0; i < n; ++i) gamma[i] = drag_[i].gamma, target[i] = u_[i] - drag_[i].shift;
   grains_error_.setZero();
-  std::vector<double> added;
-  added_impulse_.clear();
+  std::vector<double> added;               // masses, and impulses of theirs on grains at rest; empty: none
+  std::vector<Vec<dim>> added_impulse;
   if (settings.added_mass > 0)
     for (int i = 0; i < n; ++i) {
       added.push_back(added_mass_of(i));
-      added_impulse_.push_back(added[i] * (u_mean_[i] - u_mean_before_[i] + dt * convection_[i]));  // of a grain at rest
+      added_impulse.push_back(added[i] * (u_mean_[i] - u_mean_before_[i] + dt * convection_[i]));
     }
   if (!settings.grains_move) {
-    for (int i = 0; i < n; ++i) drag_force_[i] = dt * gamma[i] * target_[i];
-    for (std::size_t i = 0; i < added.size(); ++i) drag_force_[i] += added_impulse_[i];
+    for (int i = 0; i < n; ++i) drag_force_[i] = dt * gamma[i] * target[i];
+    for (std::size_t i = 0; i < added.size(); ++i) drag_force_[i] += added_impulse[i];
     return;
   }
   const double stepping = seconds();
   std::vector<Vec<dim>> force = stress_force_;
-  for (std::size_t i = 0; i < added.size(); ++i) force[i] += added_impulse_[i] / dt;
+  for (std::size_t i = 0; i < added.size(); ++i) force[i] += added_impulse[i] / dt;
   grains_.set_force(force);
-  grains_.set_drag(gamma, target_, added);
+  grains_.set_drag(gamma, target, added);
   for (auto& [boundary, follow] : follows_) follow->from = grains_.walls()[follow->wall].point;
   report.grains = grains_.step(dt);
   report.grains_time += seconds() - stepping;
@@ -427,7 +429,7 @@ void Coupling<dim>::move_grains(double dt, Report<dim>& report) {
   const auto& in_contact = grains_.in_contact();
   const auto& contact_impulse = grains_.contact_impulse();
   const auto after = grains_.by_id([](const Grains<dim>& g, int k) { return Vec<dim>(g.body[k].v); });
-  for (std::size_t i = 0; i < added.size(); ++i) drag_force_[i] += added_impulse_[i], added_impulse_[i] -= added[i] * (after[i] - v_[i]);
+  for (std::size_t i = 0; i < added.size(); ++i) drag_force_[i] += added_impulse[i];
   for (int i = 0; i < n; ++i) {
     free_[i] = !in_contact[i];
     grains_error_ += m_[i] * (after[i] - v_[i]) - dt * (m_[i] * grains_.gravity + stress_force_[i]) - drag_force_[i] - contact_impulse[i];

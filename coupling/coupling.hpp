@@ -145,12 +145,10 @@ class Coupling {
 
   // Of grains, by id.
   std::vector<Vec<dim>> x_, v_, carry_, drag_force_, stress_force_;
-  std::vector<Vec<dim>> target_;   // u - shift, as the grains were told
   Vec<dim> grains_error_;          // of their balance of momentum [N s]
   std::vector<Vec<dim>> u_, u_mean_, grad_p_;      // where the grain is; mean over its kernel
   std::vector<Vec<dim>> u_before_, u_mean_before_, grad_p_before_;  // the fluid's step
   std::vector<Vec<dim>> convection_;               // the same time's (u - w) . grad u, mean over the kernel; 0 without added mass
-  std::vector<Vec<dim>> added_impulse_;            // of added mass in the last step [N s]; empty without
   std::vector<double> r_, m_, eps_at_;
   std::vector<Place<dim>> place_;
   std::vector<char> free_;         // bore no contact in the last step

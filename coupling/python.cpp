@@ -80,7 +80,7 @@ void bind(py::module_& m, const char* suffix) {
              settings.kernel_radius = radius;
              settings.drag = drag_law(drag);
              settings.discs = one_of("Coupling: discs", discs, kinds_of_discs);
-             settings.undisturbed = undisturbed && fluid_moves, settings.added_mass = added_mass;
+             settings.undisturbed = undisturbed, settings.added_mass = added_mass;
              settings.fluid_moves = fluid_moves, settings.grains_move = grains_move;
              return std::make_unique<C>(grains, fluid, std::move(settings));
            }),

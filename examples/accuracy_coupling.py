@@ -53,17 +53,12 @@ def wake(flags):
 
 def bed_error(size, kernel):
     """Error of the mean gradient, least void fraction, seconds of a step; None, where void fractions or the equations break."""
-    d, side, spacing = 1e-3, 24, 1.32
-    rows = round(side / spacing)
+    side, rows = 24, 18
     rng = np.random.default_rng(0)
     x = (np.stack(np.meshgrid(*[np.arange(rows)] * 2), -1).reshape(-1, 2) + 0.5 + rng.uniform(-0.05, 0.05, (rows**2, 2))) * side / rows - side / 2
-    flags = SimpleNamespace(dim=2, diameter=d, velocity=1e-4, viscosity=1e-3, density=2500.0, fluid_density=1000.0, drag="di_felice", mesh_over_d=size, element="p1p1",
+    flags = SimpleNamespace(dim=2, diameter=1e-3, velocity=1e-4, viscosity=1e-3, density=2500.0, fluid_density=1000.0, drag="di_felice", mesh_over_d=size, element="p1p1",
                             kernel="smooth" if kernel else "hat", kernel_over_d=kernel, stiffness=1e4)
-    eps = 1 - len(x) * packed_bed.solid(flags) / (side * d) ** 2
-    driven = packed_bed.gradient(flags, eps, flags.velocity)
-    flow, sim = packed_bed.base(flags, [side] * 2, [True] * 2, [-side / 2] * 2, [driven / flags.fluid_density, 0.0])
-    flow.mean_pressure(0.0)
-    sim.add(x * d, d / 2, density=flags.density)
+    flow, sim, eps, driven = packed_bed.periodic_bed(flags, side, x)
     both, reports = packed_bed.couple(flags, sim, flow, False), []
     try:
         packed_bed.through(both, packed_bed.time_step(flags, sim, eps), lambda: packed_bed.superficial_velocity(flow, 0), reports)

@@ -173,16 +173,22 @@ def through(both, dt, speed, reports):
         before = now
 
 
+def periodic_bed(flags, side, x):
+    """Grains at x [d] in a fluid that a body force drives; the void fraction, and the force [N/m^3]."""
+    eps = 1 - len(x) * solid(flags) / (side * flags.diameter) ** flags.dim
+    driven = gradient(flags, eps, flags.velocity)
+    flow, sim = base(flags, [side] * flags.dim, [True] * flags.dim, [-side / 2] * flags.dim, [driven / flags.fluid_density] + [0.0] * (flags.dim - 1))
+    flow.mean_pressure(0.0)
+    sim.add(x * flags.diameter, flags.diameter / 2, density=flags.density)
+    return flow, sim, eps, driven
+
+
 def run_periodic(flags):
     side = 24 if flags.dim == 2 else 9 if flags.free else 12
     x, box, overlap = random_bed([side] * flags.dim, (JAMMED if flags.free else SOLIDS)[flags.dim], flags.seed)
     side = box[0]
     length = side * flags.diameter
-    eps = 1 - len(x) * solid(flags) / length**flags.dim
-    driven = gradient(flags, eps, flags.velocity)
-    flow, sim = base(flags, [side] * flags.dim, [True] * flags.dim, [-side / 2] * flags.dim, [driven / flags.fluid_density] + [0.0] * (flags.dim - 1))
-    flow.mean_pressure(0.0)
-    sim.add(x * flags.diameter, flags.diameter / 2, density=flags.density)
+    flow, sim, eps, driven = periodic_bed(flags, side, x)
     both, reports = couple(flags, sim, flow, False), []
     dt = time_step(flags, sim, eps)
     start = time.perf_counter()

@@ -322,8 +322,8 @@ Vec<dim> Fluid<dim>::reaction_force() const {
       if (reaction_on_change) grad_p -= pressure_slope(static_cast<int>(e), g, 1);
       for (std::size_t q = 0; q < rule.size(); ++q) {
         const Reaction<dim>& r = reaction_[e * rule.size() + q];
-          const Vec<dim> u = velocity_at<order>(static_cast<int>(e), rule[q].l, 0), change = u - velocity_at<order>(static_cast<int>(e), rule[q].l, 1);
-          sum += rule[q].weight * g.volume * (r.beta_target + r.force - r.beta * (reaction_on_change ? change : u) - r.yield * grad_p - r.inertia * change);
+        const Vec<dim> u = velocity_at<order>(static_cast<int>(e), rule[q].l, 0), change = u - velocity_at<order>(static_cast<int>(e), rule[q].l, 1);
+        sum += rule[q].weight * g.volume * (r.beta_target + r.force - r.beta * (reaction_on_change ? change : u) - r.yield * grad_p - r.inertia * change);
       }
     }
   });

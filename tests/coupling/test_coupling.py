@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +17,10 @@ GRAVITY = 9.81
 ROOT = Path(__file__).parents[2]
 
 
-def falling_grain(dim, diameter, density, law, dt_over_tau, steps):
-    """One grain in a fluid that stays at rest: velocity after the steps, that of the law, and the time."""
-    down = [0.0] * (dim - 1) + [-GRAVITY]
-    box = 20 * diameter
-    flow = fluid.Fluid(meshes.box([box] * dim, size=box / 4), density=WATER, viscosity=VISCOSITY, gravity=down)
+def grain_in_the_middle(dim, diameter, density, viscosity=VISCOSITY):
+    """Of a box of fluid at rest, and where that is."""
+    down, box = [0.0] * (dim - 1) + [-GRAVITY], 20 * diameter
+    flow = fluid.Fluid(meshes.box([box] * dim, size=box / 4), density=WATER, viscosity=viscosity, gravity=down)
     for boundary in flow.mesh.boundary_names:
         flow.wall(boundary)
     flow.solve_steady()
@@ -28,6 +28,12 @@ def falling_grain(dim, diameter, density, law, dt_over_tau, steps):
     sim.set_friction("grain", "grain", 0.3)
     middle = np.full((1, dim), box / 2)
     sim.add(middle, diameter / 2, density=density)
+    return flow, sim, middle
+
+
+def falling_grain(dim, diameter, density, law, dt_over_tau, steps):
+    """One grain in a fluid that stays at rest: velocity after the steps, that of the law, and the time."""
+    flow, sim, middle = grain_in_the_middle(dim, diameter, density)
     solid = np.pi * diameter**3 / 6  # of the sphere that the law is of
     weight = abs(density - WATER) * solid * GRAVITY
 
@@ -280,23 +286,10 @@ def test_a_lid_drains_what_the_pores_lose():
 @pytest.mark.parametrize("kernel, jumps_on", [("smooth", False), ("hat", True)])
 def test_pressure_of_a_grain_that_crosses_an_element_face(kernel, jumps_on):
     """d(eps)/dt makes pressure; that of the smooth kernel has no jump as the grain comes to another element."""
-    jumps, speed, way = [], 10 * D, 0.3 * D
-    for dt in (1e-3, 2.5e-4):
-        mesh = meshes.box([12 * D, 12 * D], [4, 4], origin=[-6 * D, -6 * D])
-        flow = fluid.Fluid(mesh, density=WATER, viscosity=VISCOSITY)
-        for boundary in mesh.boundary_names:
-            flow.wall(boundary)
-        flow.mean_pressure(0.0)
-        sim = simulation(2, np.array([[-way, 0.4 * D]]))
-        sim.velocity = np.array([[speed, 0.0]])
-        both = coupling.Coupling(sim, flow, kernel=kernel, kernel_radius=1.5 * D, drag=lambda slip, *_: 0 * slip)
-        pressures = []
-        crossing = round(way / (speed * dt))
-        for _ in range(crossing + 5):
-            both.step(dt)
-            pressures.append(flow.pressure)
-        jumps.append(np.abs(np.diff(pressures[crossing - 5:], axis=0)).max())
+    sys.path.insert(0, str(ROOT / "examples"))
+    from accuracy_coupling import jump
 
+    jumps = [jump(0.0 if kernel == "hat" else 1.5, dt) for dt in (1e-3, 2.5e-4)]
     assert jumps[1] > 0.7 * jumps[0] if jumps_on else jumps[1] < 0.4 * jumps[0]
 
 
@@ -476,15 +469,7 @@ def nothing(slip, *_):
 
 def released(dim, density, law, dt, steps, viscosity=VISCOSITY):
     """Speed of a light grain in a fluid that stays at rest, with added mass."""
-    down, box = [0.0] * (dim - 1) + [-GRAVITY], 20 * D
-    flow = fluid.Fluid(meshes.box([box] * dim, size=box / 4), density=WATER, viscosity=viscosity, gravity=down)
-    for boundary in flow.mesh.boundary_names:
-        flow.wall(boundary)
-    flow.solve_steady()
-    sim = grains.Simulation(dim=dim, gravity=down)
-    sim.set_friction("grain", "grain", 0.3)
-    middle = np.full((1, dim), box / 2)
-    sim.add(middle, D / 2, density=density)
+    flow, sim, middle = grain_in_the_middle(dim, D, density, viscosity)
     both = coupling.Coupling(sim, flow, kernel="hat", drag=law, fluid_moves=False, added_mass=0.5)
     for _ in range(steps):
         sim.position = middle
