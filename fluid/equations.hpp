@@ -228,9 +228,8 @@ void element_system(const ElementInput<dim, order>& in, const Properties<dim>& f
     std::array<Vec<dim>, n> grad_test;  // of eps w
     std::array<Vec<dim>, n> bulk_test;  // among grains that feel pressure as it is, eps div w: on div(eps w) it would hold the fluid back where eps moves through the mesh
     for (int a = 0; a < n; ++a) {
-      bulk_test[a] = at.eps * grad[a];
-      grad_test[a] = bulk_test[a] + shape[a] * at.grad_eps;
-      if (!in.reaction_on_change) bulk_test[a] = grad_test[a];
+      grad_test[a] = at.eps * grad[a] + shape[a] * at.grad_eps;
+      bulk_test[a] = in.reaction_on_change ? Vec<dim>(at.eps * grad[a]) : grad_test[a];
     }
 
     for (int a = 0; a < n; ++a) {
