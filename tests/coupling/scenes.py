@@ -5,6 +5,7 @@ import numpy as np
 from quicksand import coupling, fluid, grains, meshes
 
 D, DENSITY, WATER, VISCOSITY = 1e-3, 2500.0, 1000.0, 1e-3
+GRAVITY = 9.81
 
 
 def spheres_void_fraction(eps):
@@ -70,3 +71,22 @@ def superficial_velocity(flow):
     weight = np.abs(np.linalg.det(x[:, 1:] - x[:, :1]))
     flux = (flow.void_fraction[:, None] * flow.velocity)[corners].mean(axis=1)
     return (weight[:, None] * flux).sum(axis=0) / weight.sum()
+
+
+def grain_in_the_middle(dim, diameter, density, viscosity=VISCOSITY):
+    """Of a box of fluid at rest, and where that is."""
+    down, box = [0.0] * (dim - 1) + [-GRAVITY], 20 * diameter
+    flow = fluid.Fluid(meshes.box([box] * dim, size=box / 4), density=WATER, viscosity=viscosity, gravity=down)
+    for boundary in flow.mesh.boundary_names:
+        flow.wall(boundary)
+    flow.solve_steady()
+    sim = grains.Simulation(dim=dim, gravity=down)
+    sim.set_friction("grain", "grain", 0.3)
+    middle = np.full((1, dim), box / 2)
+    sim.add(middle, diameter / 2, density=density)
+    return flow, sim, middle
+
+
+def nothing(slip, *_):
+    """A law without drag."""
+    return 0 * slip
