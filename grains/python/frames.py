@@ -76,13 +76,16 @@ class Frames:
         self.numbers = []  # of the frames in the folder
         self.grids = {}  # XDMF of each frame, by group
         (self.folder / "frames").mkdir(parents=True, exist_ok=True)
+        later = []
         for path in sorted((self.folder / "frames").glob("*.h5")):
             if path.stem.isdigit() and int(path.stem) < count:
                 with h5py.File(path) as frame:
                     self._take(path, frame.attrs["time"], frame)
             else:
-                path.unlink()
+                later.append(path)
         self._write_index()
+        for path in later:  # the index leads to them no more
+            path.unlink()
 
     def write(self, *parts, series=None):
         """Add a frame of the scene as it is now.
@@ -130,11 +133,11 @@ class Frames:
             for number in self.numbers:
                 frames[number] = h5py.ExternalLink(f"frames/{number}.h5", "/")
 
-        write_whole(self.folder / "run.h5", hdf5_bytes(fill))
         for name, grids in self.grids.items():
             text = (f'<?xml version="1.0"?>\n<Xdmf Version="2.0"><Domain>\n<Grid Name="{name}" GridType="Collection" '
                     f'CollectionType="Temporal">\n{"".join(grids)}</Grid>\n</Domain></Xdmf>\n')
             write_whole(self.folder / f"{name}.xdmf", text.encode())
+        write_whole(self.folder / "run.h5", hdf5_bytes(fill))  # last: where it is, all else is
 
 
 def _grains(sim):
