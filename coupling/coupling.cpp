@@ -294,7 +294,63 @@ void Coupling<dim>::set_reaction(double dt) {
     inertia = kernel_.to_nodes(inertia, 0.0);
     for (std::size_t k = 0; k < inertia.size(); ++k) at_nodes[k].inertia = inertia[k] / kernel_.masses()[k];
   }
+  if (kernel_.is_resolved() && !x_.empty()) {
+    const std::vector<Vec<dim>> force = short_wave_drag();
+    for (std::size_t k = 0; k < force.size(); ++k) at_nodes[k].force += force[k];
+  }
   fluid_.set_reaction(std::move(at_nodes));
+}
+
+// -beta (1 - P)^3 w of the text above.
+template <int dim>
+std::vector<Vec<dim>> Coupling<dim>::short_wave_drag() const {
+  using Mat = fluid::Mat<dim>;
+  std::vector<double> gamma(x_.size());
+  for (std::size_t i = 0; i < gamma.size(); ++i) gamma[i] = answer_[i].beta;
+  const std::vector<double> by_carriers = kernel_.density(gamma), beta = kernel_.at_nodes(by_carriers);
+  const auto pass = [&]<class T>(const std::vector<T>& f) {
+    std::vector<T> c = kernel_.mean(f);
+    for (std::size_t g = 0; g < c.size(); ++g) c[g] *= by_carriers[g];
+    c = kernel_.at_nodes(c);
+    for (std::size_t k = 0; k < c.size(); ++k) c[k] *= beta[k] > 0 ? 1 / beta[k] : 0.0;
+    return c;
+  };
+  const auto less_passed = [&](std::vector<Vec<dim>>& f) {
+    const std::vector<Vec<dim>> passed = pass(f);
+    for (std::size_t k = 0; k < f.size(); ++k) f[k] -= passed[k];
+  };
+  const auto& x = walker_.nodes();
+  std::vector<Vec<dim>> wave = fluid_.velocity(), shift = x;
+  wave.resize(x.size());
+  std::vector<Mat> slope(x.size(), Mat::Zero());
+  for (const auto& corners : mesh_->elements) {
+    const auto g = fluid::geometry<dim>(x, corners);
+    Mat here = Mat::Zero();
+    for (int a = 0; a <= dim; ++a) here += wave[corners[a]] * g.grad_l[a].transpose();
+    for (const int a : corners) slope[mesh_->master[a]] += g.volume / (dim + 1) * here;
+  }
+  for (std::size_t k = 0; k < x.size(); ++k)
+    if (mesh_->master[k] == static_cast<int>(k)) slope[k] /= kernel_.masses()[k];
+  for (Vec<dim>& s : shift)
+    for (int axis = 0; axis < dim; ++axis)
+      if (grains_.box().period[axis] > 0) s[axis] = 0.0;  // no field is linear along it
+  less_passed(wave), less_passed(shift);
+  slope = pass(slope);
+  for (std::size_t k = 0; k < x.size(); ++k) wave[k] -= slope[k] * shift[k];
+  for (int power = 1; power < 3; ++power) less_passed(wave);
+  std::vector<Vec<dim>> slip(x_.size()), drag(x_.size());
+  for (std::size_t i = 0; i < x_.size(); ++i) slip[i] = u_before_[i] - v_[i];
+  for (int round = 0; round < 3; ++round) {
+    for (std::size_t i = 0; i < x_.size(); ++i) drag[i] = gamma[i] * slip[i];
+    const std::vector<Vec<dim>> c = kernel_.density(drag), there = kernel_.at_nodes(c);
+    for (std::size_t k = 0; k < x.size(); ++k)
+      if (beta[k] > 0) wave[k] += there[k] / beta[k];
+    for (std::size_t i = 0; i < x_.size(); ++i)
+      if (const double here = kernel_.at_grain(static_cast<int>(i), by_carriers); here > 0) slip[i] -= kernel_.at_grain(static_cast<int>(i), c) / here;
+  }
+  for (int power = 0; power < 3; ++power) less_passed(wave);
+  for (std::size_t k = 0; k < x.size(); ++k) wave[k] *= -beta[k];
+  return wave;
 }
 
 template <int dim>

@@ -65,8 +65,13 @@ Kernel<dim>::Kernel(std::shared_ptr<const Mesh<dim>> mesh, Shape shape, double r
       periodic_[k] = period[k] > 0 ? std::max(1, static_cast<int>(std::lround(period[k] / wanted))) : 0;
       spacing_[k] = periodic_[k] > 0 ? period[k] / periodic_[k] : wanted;
     }
-    double largest = 0.0;
-    for (const auto& element : mesh_->elements) largest = std::max(largest, fluid::geometry<dim>(mesh_->nodes, element).volume);
+    double largest = 0.0, smallest = std::numeric_limits<double>::infinity();
+    for (const auto& element : mesh_->elements) {
+      const double volume = fluid::geometry<dim>(mesh_->nodes, element).volume;
+      largest = std::max(largest, volume), smallest = std::min(smallest, volume);
+    }
+    // K lets half of a wave of length 2 h pass at h = 2.67 radii.
+    resolved_ = std::pow(smallest * (dim == 2 ? 2 : 6), 1.0 / dim) < 2.5 * radius;
     const int elements_at_node = dim == 2 ? 6 : 24;
     if (std::pow(largest * elements_at_node / (dim + 1), 1.0 / dim) > 0.4 * wanted) {
       int halvings = 0;
@@ -141,6 +146,11 @@ void Kernel<dim>::place(const std::vector<Vec<dim>>& nodes) {
   for (std::size_t k = 0; k < spline_.size(); ++k) inv_spline_weight_[spline_[k]] += value_[k];
   for (double& w : inv_spline_weight_) w = w > 0 ? 1 / w : 0.0;
   for (const auto& [image, spline] : images_) inv_spline_weight_[image] = inv_spline_weight_[spline];
+  if (!resolved_) return;
+  nodes_ = weights_at(nodes);
+  inv_node_weight_.assign(carriers(), 1.0);
+  inv_node_weight_ = mean(std::vector<double>(nodes.size(), 1.0));
+  for (double& w : inv_node_weight_) w = w > 0 ? 1 / w : 0.0;
 }
 
 // The splines that a node meets, gathered on the part of the grid that they lie in.
@@ -198,20 +208,25 @@ void Kernel<dim>::add_row(int node, const std::vector<Vec<dim>>& nodes) {
 
 template <int dim>
 void Kernel<dim>::weigh(std::span<const Vec<dim>> x, const std::vector<Place<dim>>& places) {
-  if (shape_ == Shape::hat) {
-    carrier_.clear(), weight_.clear();
-    for (const Place<dim>& place : places)
-      for (int a = 0; a <= dim; ++a) carrier_.push_back(mesh_->master[mesh_->elements[place.element][a]]), weight_.push_back(std::max(place.l[a], 0.0));  // below 0 by rounding, on a face
+  if (shape_ == Shape::smooth) {
+    grains_ = weights_at(x);
     return;
   }
-  carrier_.resize(x.size()), weight_.resize(x.size() * splines);
+  grains_ = {};
+  for (const Place<dim>& place : places)
+    for (int a = 0; a <= dim; ++a) grains_.carrier.push_back(mesh_->master[mesh_->elements[place.element][a]]), grains_.weight.push_back(std::max(place.l[a], 0.0));  // below 0 by rounding, on a face
+}
+
+template <int dim>
+auto Kernel<dim>::weights_at(std::span<const Vec<dim>> x) const -> Points {
+  Points points{std::vector<int>(x.size()), std::vector<double>(x.size() * splines)};
   for (std::size_t i = 0; i < x.size(); ++i) {
     const Splines at = splines_at(x[i]);
     int first = at.first[dim - 1] - first_[dim - 1];
     for (int axis = dim - 2; axis >= 0; --axis) first = first * count_[axis] + at.first[axis] - first_[axis];
-    carrier_[i] = first;
+    points.carrier[i] = first;
     const auto along = Eigen::Map<const Eigen::Array4d>(at.along[0].data());
-    double* b = &weight_[i * splines];
+    double* b = &points.weight[i * splines];
     Eigen::Array4d met = Eigen::Array4d::Zero();  // in all less than 1 where the mesh ends within a spline that no sample meets
     for (int last = 0, k = 0; last < 4; ++last)
       for (int middle = 0; middle < (dim == 3 ? 4 : 1); ++middle, k += 4) {
@@ -224,6 +239,7 @@ void Kernel<dim>::weigh(std::span<const Vec<dim>> x, const std::vector<Place<dim
       }
     Eigen::Map<Eigen::Array<double, splines, 1>>(b + 0) *= 1 / met.sum();
   }
+  return points;
 }
 
 template class Kernel<2>;

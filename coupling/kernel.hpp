@@ -36,16 +36,28 @@ class Kernel {
   template <class T>
   T at_grain(int i, const std::vector<T>& at_carriers) const {
     T sum = 0.0 * at_carriers[0];
-    each_weight(i, [&](int carrier, double weight) { sum += weight * at_carriers[carrier]; });
+    each_weight(grains_, i, [&](int carrier, double weight) { sum += weight * at_carriers[carrier]; });
     return sum;
   }
   template <class T>
   void give(int i, const T& value, std::vector<T>& to_carriers) const {
-    each_weight(i, [&](int carrier, double weight) { to_carriers[carrier] += weight * value; });
+    each_weight(grains_, i, [&](int carrier, double weight) { to_carriers[carrier] += weight * value; });
   }
   template <class T>
   std::vector<T> to_nodes(const std::vector<T>& of_carriers, const T& zero) const;  // sums, not yet over M_a
   std::size_t carriers() const { return shape_ == Shape::hat ? masses_.size() : inv_spline_weight_.size(); }
+
+  // Whether there can be flow on the mesh that the smooth kernel does not see; what follows is for these, of carriers with their images.
+  bool is_resolved() const { return resolved_; }
+  // sum_i f_i B_g(x_i)/w_g of grains: at_nodes of it is their density [1/m^dim].
+  template <class T>
+  std::vector<T> density(const std::vector<T>& of_grains) const;
+  // sum_a M_a B_g(x_a) f_a/sum_a M_a B_g(x_a)
+  template <class T>
+  std::vector<T> mean(const std::vector<T>& at_nodes) const;
+  // sum_g B_g(x_a) c_g
+  template <class T>
+  std::vector<T> at_nodes(const std::vector<T>& of_carriers) const;
 
  private:
   static constexpr int splines = dim == 2 ? 16 : 64;  // that are not 0 at a point
@@ -60,20 +72,30 @@ class Kernel {
   };
   Splines splines_at(const Vec<dim>& x) const;
   int on_grid(int number, int axis) const { return on_grid_[axis][number - before_[axis]]; }
+  struct Points {  // grains, or nodes: of each the first carrier, and what it gives to all that it meets; the hat: all carriers
+    std::vector<int> carrier;
+    std::vector<double> weight;
+  };
   template <class Use>
-  void each_weight(int i, Use&& use) const {
+  void each_weight(const Points& points, int i, Use&& use) const {
     if (shape_ == Shape::hat) {
-      for (int k = i * (dim + 1); k < (i + 1) * (dim + 1); ++k) use(carrier_[k], weight_[k]);
+      for (int k = i * (dim + 1); k < (i + 1) * (dim + 1); ++k) use(points.carrier[k], points.weight[k]);
       return;
     }
-    const double* weight = &weight_[i * splines];
+    const double* weight = &points.weight[i * splines];
     for (int last = 0; last < 4; ++last)
       for (int middle = 0; middle < (dim == 3 ? 4 : 1); ++middle, weight += 4) {
-        const int from = carrier_[i] + (dim == 3 ? last * count_[1] + middle : last) * count_[0];
+        const int from = points.carrier[i] + (dim == 3 ? last * count_[1] + middle : last) * count_[0];
         for (int m = 0; m < 4; ++m) use(from + m, weight[m]);
       }
   }
   void add_row(int node, const std::vector<Vec<dim>>& nodes);
+  Points weights_at(std::span<const Vec<dim>> x) const;
+  template <class T>
+  void add_images(std::vector<T>& of_carriers) const {
+    for (const auto& [image, spline] : images_) of_carriers[spline] += of_carriers[image];
+    for (const auto& [image, spline] : images_) of_carriers[image] = of_carriers[spline];
+  }
 
   std::shared_ptr<const Mesh<dim>> mesh_;
   Shape shape_;
@@ -94,8 +116,9 @@ class Kernel {
   // int N_a B_g, of each node a the splines g that it meets; nothing of images.
   std::vector<int> row_start_, spline_;
   std::vector<double> value_;
-  std::vector<int> carrier_;  // the first of each grain; for the hat, all
-  std::vector<double> weight_;
+  Points grains_, nodes_;
+  std::vector<double> inv_node_weight_;  // 1/sum_a M_a B_g(x_a)
+  bool resolved_ = false;
 };
 
 // Defined here: of any T that can be added and scaled.
@@ -130,6 +153,37 @@ std::vector<T> Kernel<dim>::to_nodes(const std::vector<T>& of_carriers, const T&
     }
   }
   for (std::size_t k = 0; k < sum.size(); ++k) sum[k] = sum[mesh_->master[k]];
+  return sum;
+}
+
+template <int dim>
+template <class T>
+std::vector<T> Kernel<dim>::density(const std::vector<T>& of_grains) const {
+  std::vector<T> sum(carriers(), 0.0 * of_grains[0]);
+  for (std::size_t i = 0; i < of_grains.size(); ++i) give(static_cast<int>(i), of_grains[i], sum);
+  add_images(sum);
+  for (std::size_t g = 0; g < sum.size(); ++g) sum[g] *= inv_spline_weight_[g];
+  return sum;
+}
+
+template <int dim>
+template <class T>
+std::vector<T> Kernel<dim>::mean(const std::vector<T>& at_nodes) const {
+  std::vector<T> sum(carriers(), 0.0 * at_nodes[0]);
+  for (std::size_t a = 0; a < at_nodes.size(); ++a)
+    if (mesh_->master[a] == static_cast<int>(a))
+      each_weight(nodes_, static_cast<int>(a), [&](int carrier, double weight) { sum[carrier] += weight * masses_[a] * at_nodes[a]; });
+  add_images(sum);
+  for (std::size_t g = 0; g < sum.size(); ++g) sum[g] *= inv_node_weight_[g];
+  return sum;
+}
+
+template <int dim>
+template <class T>
+std::vector<T> Kernel<dim>::at_nodes(const std::vector<T>& of_carriers) const {
+  std::vector<T> sum(masses_.size(), 0.0 * of_carriers[0]);
+  for (std::size_t a = 0; a < sum.size(); ++a)
+    each_weight(nodes_, static_cast<int>(a), [&](int carrier, double weight) { sum[a] += weight * of_carriers[carrier]; });
   return sum;
 }
 

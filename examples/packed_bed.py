@@ -46,6 +46,8 @@ results.json
     velocity_mf velocity_mf_law error_mf   minimum fluidisation [m/s] [m/s] [-]; null without --fluidise
     velocity_mf_whole velocity_mf_whole_law   of the whole bed, see above [m/s]; null likewise
     error_held                          periodic: of the same bed held [-]; null otherwise
+    error_local                         periodic: of the fluid alone, with the same law as a drag in each point of its void fraction: what the packing is off the law by, and no scheme
+                                        between grains and fluid; null otherwise [-]
     void_fraction_min                   at nodes: a field that reaches 0 ends the run [-]
     grain_speed                         fastest grain, relative to the mean of all, over the superficial velocity, at the end [-]
     overlap                             periodic: largest of two grains, over d [-]
@@ -183,6 +185,20 @@ def periodic_bed(flags, side, x):
     return flow, sim, eps, driven
 
 
+def local_error(flags, side, x, void_fraction, superficial):
+    """`error` where the fluid meets the law in each point of this void fraction, without grains."""
+    flow, _, eps, driven = periodic_bed(flags, side, x)
+    flow.void_fraction = void_fraction
+    corners, points = flow.mesh.elements, flow.quadrature_points
+    per_element = len(points) // len(corners)
+    # Barycentric coordinates, the same in all elements, from the first: it lies on no periodic side's other end.
+    shape = np.linalg.solve(np.vstack([flow.nodes[corners[0]].T, np.ones(flow.dim + 1)]), np.vstack([points[:per_element].T, np.ones(per_element)])).T
+    of_node = np.array([gradient(flags, e, superficial) * e**2 / superficial for e in void_fraction[:len(flow.mesh.nodes)]])
+    flow.reaction(beta=(of_node[corners] @ shape.T).ravel(), target=np.zeros(flow.dim))
+    flow.solve_steady()
+    return driven / gradient(flags, eps, superficial_velocity(flow, 0)) - 1
+
+
 def run_periodic(flags):
     side = 24 if flags.dim == 2 else 9 if flags.free else 12
     x, box, overlap = random_bed([side] * flags.dim, (JAMMED if flags.free else SOLIDS)[flags.dim], flags.seed)
@@ -195,6 +211,7 @@ def run_periodic(flags):
     through(both, dt, lambda: superficial_velocity(flow, 0), reports)
     found = superficial_velocity(flow, 0)
     held = driven / gradient(flags, eps, found) - 1
+    local = local_error(flags, side, x, flow.void_fraction, found)
     if flags.free:
         sim.gravity = [-driven * eps * length**flags.dim / sim.mass.sum()] + [0.0] * (flags.dim - 1)
         sim.tolerance, sim.accept_unconverged = 1e-3, True  # what contacts leave open is speed, of the share of the slip that the tolerance says; steps that miss it are counted
@@ -205,7 +222,7 @@ def run_periodic(flags):
         found = superficial_velocity(flow, 0) - eps * (sim.mass @ sim.velocity[:, 0]) / sim.mass.sum()
     return flow, sim, reports, time.perf_counter() - start, {
         "porosity": eps, "pressure_drop": driven * length, "pressure_drop_law": gradient(flags, eps, found) * length, "velocity_found": found, "dt": dt, "overlap": overlap,
-        "error_held": held}, None
+        "error_held": held, "error_local": local}, None
 
 
 def settle(flags, sim):
@@ -388,7 +405,7 @@ def measure(flags):
     """Results, and what to plot."""
     kept = {name: value for name, value in vars(flags).items() if name not in ("out", "quick")}
     flow, sim, reports, seconds, results, curves = (run_fluidised if flags.fluidise else run_open if flags.open else run_periodic)(flags)
-    results = kept | {"velocity_mf": None, "velocity_mf_law": None, "error_mf": None, "velocity_mf_whole": None, "velocity_mf_whole_law": None, "overlap": None, "error_held": None} | results
+    results = kept | {"velocity_mf": None, "velocity_mf_law": None, "error_mf": None, "velocity_mf_whole": None, "velocity_mf_whole_law": None, "overlap": None, "error_held": None, "error_local": None} | results
     results |= {"error": results["pressure_drop"] / results["pressure_drop_law"] - 1, "void_fraction_min": flow.void_fraction.min(),
                 "grain_speed": np.abs(sim.velocity - sim.mass @ sim.velocity / sim.mass.sum()).max() / results["velocity_found"], "grains": sim.count, "steps": len(reports)}
     results |= {"unconverged_steps": sum(r.grains.unconverged for r in reports)} if flags.free else {"unconverged_steps": None}
@@ -409,7 +426,7 @@ def main():
         n = len(flow.mesh.nodes)
         study.plot_flow(flags.out / "bed.png", flow.mesh, [("void fraction [-]", flow.void_fraction[:n], None, None),
                                                            ("speed [m/s]", np.linalg.norm(flow.velocity[:n], axis=1), None, flow.velocity[:n])])
-    units = {"porosity": "-", "pressure_drop": "Pa", "error": "-", "velocity_mf": "m/s", "void_fraction_min": "-", "grain_speed": "-", "momentum_error": "-",
+    units = {"porosity": "-", "pressure_drop": "Pa", "error": "-", "error_local": "-", "velocity_mf": "m/s", "void_fraction_min": "-", "grain_speed": "-", "momentum_error": "-",
              "volume_error": "-", "carried_impulse": "-", "grains": "", "steps": "", "dofs": "", "wall_time": "s"}
     references = {"pressure_drop": f"{results['pressure_drop_law']:.6g}", "error": "0", "momentum_error": "0", "volume_error": "0"}
     if flags.fluidise:

@@ -32,13 +32,18 @@ def test_with_drag_by_the_undisturbed_flow_it_falls_as_the_law_says(tmp_path, di
     assert abs(found["error"]) < 0.015 and found["wake_over_slip"] > 0.005
 
 
-# Random beds: drag is spread by the kernel and the flow goes round single grains, the finer the elements the better. Measured, mean and standard deviation of five seeds:
-# -0.63 (13), -0.08 (4), -0.10 (3) and 1.0 (1.0) %.
-@pytest.mark.parametrize("args, most", [((), 0.008), (("--mesh-over-d", 6), 0.005), (("--dim", 3), 0.005), (("--open",), 0.02)])
+# Random beds. Measured, seed 0: -0.24, 0.26, -0.02, -0.08 and 0.93 % (means of five seeds: -0.37, 0.58, -0.07, -0.05, 1.5); of the same law in each point of the void fraction, which
+# tells what the packing does: 0.11, 0.28, 0.03, 0.00 %. Without drag on waves shorter than the kernel -0.45, -1.3 at 3 and 0.5.
+@pytest.mark.parametrize("args, most", [((), 0.005), (("--mesh-over-d", 0.5), 0.005), (("--mesh-over-d", 6), 0.005), (("--dim", 3), 0.005), (("--open",), 0.02)])
 def test_a_held_bed_has_the_pressure_gradient_of_the_law(tmp_path, args, most):
     found = results("packed_bed", tmp_path, *args)
     assert abs(found["error"]) < most
     assert found["momentum_error"] < 1e-11 and found["volume_error"] < 1e-10
+    if found["error_local"] is None:
+        assert args == ("--open",)
+    else:
+        assert abs(found["error"] - found["error_local"]) < 0.004
+        assert found["steps"] <= 40  # to the steady flow, at k = 1e4
 
 
 # Jammed discs have channels, and are off the law; let go, they keep the flow that they had when they were held. Measured: 0.06 %, up to 0.32 over five seeds. While elements
