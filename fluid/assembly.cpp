@@ -7,6 +7,7 @@
 #include <algorithm>
 #include <chrono>
 #include <numeric>
+#include <type_traits>
 
 namespace quicksand::fluid {
 
@@ -19,29 +20,50 @@ double seconds() { return std::chrono::duration<double>(std::chrono::steady_cloc
 }  // namespace
 
 template <int dim>
-template <int order>
-ElementInput<dim, order> Fluid<dim>::input(int element) const {
-  ElementInput<dim, order> in;
-  for (int a = 0; a <= dim; ++a) {
-    const int k = mesh_->elements[element][a];
-    in.x[a] = position_[k], in.mesh_velocity[a] = mesh_velocity_[k];
-    in.pressure[a] = x_[0][space_.pressure_dof(space_.vertex[k])];
-  }
-  for (int a = 0; a < in.n; ++a) {
-    const int node = space_.node_of[element * in.n + a];
-    for (int t = 0; t < 3; ++t) in.eps[t][a] = eps_[t][node];
-    in.flux[0][a] = Eigen::Map<const Vec<dim>>(&guess_[space_.first_dof[node]]);
-    for (int t = 0; t < 2; ++t) in.flux[t + 1][a] = Eigen::Map<const Vec<dim>>(&x_[t][space_.first_dof[node]]);
-  }
-  if constexpr (order == 1)
-    for (int a = 0; a < in.n; ++a) in.eps_slope[a] = eps_slope_[space_.node_of[element * in.n + a]];
-  if (!reaction_.empty()) in.reaction = &reaction_[element * quadrature<dim, order>().size()];
-  if constexpr (order == 1)
-    for (int t = 0; t < 2; ++t) in.subscale[t] = &subscale_[t][element * quadrature<dim, 1>().size()];
-  if (!advance_.empty()) in.advance = &advance_[element * quadrature<dim, order>().size()];
+template <int order, class T>
+struct Fluid<dim>::Input : ElementInput<dim, order, T> {
+  static constexpr int points = quadrature_count<dim, order>;
+  std::array<Reaction<dim, T>, points> reactions;
+  std::array<std::array<VecOf<dim, T>, points>, 2> subscales;
+  std::array<VecOf<dim, T>, points> advances;
+};
+
+// One element to a lane; lanes that are left repeat the last.
+template <int dim>
+template <int order, class T>
+void Fluid<dim>::gather(std::span<const int> elements, Input<order, T>& in) const {
+  in.reaction = reaction_.empty() ? nullptr : in.reactions.data();
+  in.advance = advance_.empty() ? nullptr : in.advances.data();
+  if constexpr (order == 1) in.subscale = {in.subscales[0].data(), in.subscales[1].data()};
   in.reaction_on_change = reaction_on_change;
   in.advection = settings.advection != Advection::none;
-  return in;
+  for (int lane = 0; lane < lanes_of<T>; ++lane) {
+    const std::size_t element = elements[std::min<std::size_t>(lane, elements.size() - 1)];
+    for (int a = 0; a <= dim; ++a) {
+      const int k = mesh_->elements[element][a];
+      put(in.x[a], lane, position_[k]), put(in.mesh_velocity[a], lane, mesh_velocity_[k]);
+      put(in.pressure[a], lane, x_[0][space_.pressure_dof(space_.vertex[k])]);
+    }
+    for (int a = 0; a < in.n; ++a) {
+      const int node = space_.node_of[element * in.n + a], dof = space_.first_dof[node];
+      for (int t = 0; t < 3; ++t) put(in.eps[t][a], lane, eps_[t][node]);
+      put(in.flux[0][a], lane, Eigen::Map<const Vec<dim>>(&guess_[dof]));
+      for (int t = 0; t < 2; ++t) put(in.flux[t + 1][a], lane, Eigen::Map<const Vec<dim>>(&x_[t][dof]));
+      if constexpr (order == 1) put(in.eps_slope[a], lane, eps_slope_[node]);
+    }
+    for (int q = 0; q < in.points; ++q) {
+      const std::size_t point = element * in.points + q;
+      if (in.reaction) {
+        const Reaction<dim>& from = reaction_[point];
+        Reaction<dim, T>& to = in.reactions[q];
+        put(to.beta, lane, from.beta), put(to.yield, lane, from.yield), put(to.inertia, lane, from.inertia);
+        put(to.beta_target, lane, from.beta_target), put(to.force, lane, from.force), put(to.follows, lane, from.follows);
+      }
+      if (in.advance) put(in.advances[q], lane, advance_[point]);
+      if constexpr (order == 1)
+        for (int t = 0; t < 2; ++t) put(in.subscales[t][q], lane, subscale_[t][point]);
+    }
+  }
 }
 
 // grad eps at the nodes, the mean over the elements around by volume: of second order inside where they are alike.
@@ -66,24 +88,33 @@ template <int dim>
 std::vector<Vec<dim>> Fluid<dim>::subscales(const std::vector<double>& x, const TimeWeights& time) const {
   if (velocity_order() != 1) return {};
   std::vector<Vec<dim>> all(subscale_[0].size());
-  for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
-    std::array<Vec<dim>, dim + 1> flux;
-    std::array<double, dim + 1> p;
-    for (int a = 0; a <= dim; ++a) {
-      const int node = space_.node_of[e * (dim + 1) + a];
-      flux[a] = Eigen::Map<const Vec<dim>>(&x[space_.first_dof[node]]), p[a] = x[space_.pressure_dof(node)];
-    }
-    const std::size_t points = quadrature<dim, 1>().size();
-    if (residual_.empty()) element_subscale<dim>(input<1>(static_cast<int>(e)), properties, time, flux, p, &all[e * points]);
+  constexpr int points = quadrature_count<dim, 1>;
+  Input<1, Lanes> in;
+  std::vector<int> elements(mesh_->elements.size());
+  std::iota(elements.begin(), elements.end(), 0);
+  for (std::size_t first = 0; first < elements.size(); first += Lanes::count) {
+    const auto here = std::span(elements).subspan(first, std::min<std::size_t>(Lanes::count, elements.size() - first));
+    std::array<VecOf<dim, Lanes>, dim + 1> flux;
+    std::array<Lanes, dim + 1> p;
+    for (std::size_t lane = 0; lane < Lanes::count; ++lane)
+      for (int a = 0; a <= dim; ++a) {
+        const int node = space_.node_of[here[std::min(lane, here.size() - 1)] * (dim + 1) + a];
+        put(flux[a], lane, Eigen::Map<const Vec<dim>>(&x[space_.first_dof[node]])), put(p[a], lane, x[space_.pressure_dof(node)]);
+      }
+    std::array<VecOf<dim, Lanes>, points> found;
+    if (residual_.empty()) gather(here, in), element_subscale<dim, Lanes>(in, properties, time, flux, p, found.data());
     else
-      for (std::size_t q = e * points; q < (e + 1) * points; ++q) all[q] = residual_[q].subscale(flux, p);
+      for (int q = 0; q < points; ++q) found[q] = residual_[first / Lanes::count * points + q].subscale(flux, p);
+    for (std::size_t lane = 0; lane < here.size(); ++lane)
+      for (int q = 0; q < points; ++q)
+        for (int i = 0; i < dim; ++i) all[(first + lane) * points + q][i] = get(found[q][i], lane);
   }
   return all;
 }
 
 template <int dim>
-template <int order>
-void Fluid<dim>::scatter(int local, const ElementSystem<dim, order>& system) {
+template <int order, class T>
+void Fluid<dim>::scatter(int local, int lane, const ElementSystem<dim, order, T>& system) {
   constexpr int n = shape_count<dim, order>;
   const int* node = &space_.node_of[space_.elements[local] * n];
   const int* place = &space_.place[static_cast<std::size_t>(local) * n * n];
@@ -91,10 +122,10 @@ void Fluid<dim>::scatter(int local, const ElementSystem<dim, order>& system) {
     if (!space_.mine(node[a])) continue;
     const int row = space_.first_dof[node[a]] - space_.begin, from = dof_of<dim>(a), rows = a <= dim ? dim + 1 : dim;
     for (int i = 0; i < rows; ++i) {
-      b_[row + i] += system.b[from + i];
+      b_[row + i] += get(system.b[from + i], lane);
       double* in_row = &values_[space_.row_start[row + i]];
       for (int b = 0; b < n; ++b)
-        for (int j = 0; j < (b <= dim ? dim + 1 : dim); ++j) in_row[place[a * n + b] + j] += system.a(from + i, dof_of<dim>(b) + j);
+        for (int j = 0; j < (b <= dim ? dim + 1 : dim); ++j) in_row[place[a * n + b] + j] += get(system.a(from + i, dof_of<dim>(b) + j), lane);
     }
   }
 }
@@ -104,17 +135,21 @@ template <int order>
 void Fluid<dim>::assemble(const TimeWeights& time, bool newton) {
   values_.assign(space_.column.size(), 0.0);
   b_.assign(space_.end - space_.begin, 0.0);
-  ElementSystem<dim, order> system;
+  using T = std::conditional_t<order == 1, Lanes, double>;
+  ElementSystem<dim, order, T> system;
+  Input<order, T> in;
   // Not where ranks assemble their own elements: all know all subscales, of the same code, to the last bit.
   const bool keep = order == 1 && !newton && ranks() == 1;
-  const std::size_t points = quadrature<dim, order>().size();
-  residual_.resize(keep ? mesh_->elements.size() * points : 0);
-  for (std::size_t local = 0; local < space_.elements.size(); ++local) {
-    const int element = space_.elements[local];
-    ElementInput<dim, order> in = input<order>(element);
+  const std::span elements(space_.elements);
+  residual_.resize(keep ? (elements.size() + Lanes::count - 1) / Lanes::count * in.points : 0);
+  for (std::size_t first = 0; first < elements.size(); first += lanes_of<T>) {
+    const auto here = elements.subspan(first, std::min<std::size_t>(lanes_of<T>, elements.size() - first));
+    gather(here, in);
     in.newton = newton;
-    element_system<dim, order>(in, properties, time, system, keep ? &residual_[element * points] : nullptr);
-    scatter<order>(static_cast<int>(local), system);
+    Residual<dim, T>* residual = nullptr;
+    if constexpr (order == 1) residual = keep ? &residual_[first / Lanes::count * in.points] : nullptr;
+    element_system<dim, order, T>(in, properties, time, system, residual);
+    for (std::size_t lane = 0; lane < here.size(); ++lane) scatter(static_cast<int>(first + lane), static_cast<int>(lane), system);
   }
   for (int node = 0; node < space_.nodes(); ++node)
     if (space_.is_vertex(node) && space_.mine(node))
@@ -139,7 +174,8 @@ void Fluid<dim>::add_boundaries() {
         q += quadrature<dim - 1, 2>().size();
         continue;
       }
-      const ElementInput<dim, order> in = input<order>(space_.elements[local]);
+      Input<order, double> in;
+      gather(std::span(&facet.element, 1), in);
       ElementSystem<dim, order> system;
       system.a.setZero(), system.b.setZero();
       along<dim>(facet, [&](const Barycentric<dim>& l, double weight) {
@@ -169,7 +205,7 @@ void Fluid<dim>::add_boundaries() {
           }
         ++q;
       });
-      scatter<order>(local, system);
+      scatter(local, 0, system);
     }
   }
 }
@@ -197,7 +233,7 @@ std::vector<double> Fluid<dim>::solve(const char* function, const std::vector<do
     if (held.last == 0) continue;
     Eigen::Map<Vec<dim>> flux(&x[space_.first_dof[node]]);
     Vec<dim> along = held.frame.transpose() * flux;
-    along.head(held.last) = held.value.head(held.last);
+    for (int axis = 0; axis < held.last; ++axis) along[axis] = held.value[axis];
     flux = held.frame * along;
   }
   const int pinned = has_pressure_reference() ? -1 : space_.pressure_dof(space_.vertex[mesh_->elements[0][0]]);

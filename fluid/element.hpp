@@ -1,6 +1,8 @@
 // Simplices with shape functions of order 1 or 2, and quadrature on them. Barycentric coordinates L_0 ... L_dim throughout.
 #pragma once
 
+#include "lanes.hpp"
+
 #include "meshes/mesh.hpp"
 
 #include <Eigen/Geometry>
@@ -13,6 +15,8 @@ namespace quicksand::fluid {
 
 using meshes::Mesh;
 using meshes::Vec;
+template <int dim, class T>
+using VecOf = Eigen::Matrix<T, dim, 1>;
 
 template <int dim>
 constexpr int edges_of_simplex = dim * (dim + 1) / 2;
@@ -43,10 +47,10 @@ std::array<double, shape_count<dim, order>> shapes(const Barycentric<dim>& l) {
 }
 
 // Gradients of the shape functions where grad_l are those of the barycentric coordinates.
-template <int dim, int order>
-std::array<Vec<dim>, shape_count<dim, order>> shape_gradients(const Barycentric<dim>& l, const std::array<Vec<dim>, dim + 1>& grad_l) {
-  std::array<Vec<dim>, shape_count<dim, order>> g;
-  for (int a = 0; a <= dim; ++a) g[a] = order == 1 ? grad_l[a] : Vec<dim>((4 * l[a] - 1) * grad_l[a]);
+template <int dim, int order, class T>
+std::array<VecOf<dim, T>, shape_count<dim, order>> shape_gradients(const Barycentric<dim>& l, const std::array<VecOf<dim, T>, dim + 1>& grad_l) {
+  std::array<VecOf<dim, T>, shape_count<dim, order>> g;
+  for (int a = 0; a <= dim; ++a) g[a] = order == 1 ? grad_l[a] : VecOf<dim, T>((4 * l[a] - 1) * grad_l[a]);
   if constexpr (order == 2)
     for (int k = 0; k < edges_of_simplex<dim>; ++k) {
       const auto [a, b] = simplex_edges<dim>[k];
@@ -55,28 +59,29 @@ std::array<Vec<dim>, shape_count<dim, order>> shape_gradients(const Barycentric<
   return g;
 }
 
-template <int dim>
+template <int dim, class T = double>
 struct Geometry {
-  double volume;                          // [m^dim]
-  std::array<Vec<dim>, dim + 1> grad_l;   // of the barycentric coordinates [1/m]
+  T volume;                               // [m^dim]
+  std::array<VecOf<dim, T>, dim + 1> grad_l;   // of the barycentric coordinates [1/m]
 };
 
-template <int dim>
-[[gnu::always_inline]] inline Geometry<dim> geometry(const std::array<Vec<dim>, dim + 1>& x) {
-  std::array<Vec<dim>, dim> across;  // what is normal to the other edges from x[0], times their area
-  double six_volumes;                // 2D: two
+template <int dim, class T = double>
+[[gnu::always_inline]] inline Geometry<dim, T> geometry(const std::array<VecOf<dim, T>, dim + 1>& x) {
+  using Vector = VecOf<dim, T>;
+  std::array<Vector, dim> across;  // what is normal to the other edges from x[0], times their area
+  T six_volumes;                // 2D: two
   if constexpr (dim == 2) {
-    const Vec<dim> a = x[1] - x[0], b = x[2] - x[0];
-    across = {Vec<dim>(b.y(), -b.x()), Vec<dim>(-a.y(), a.x())};
+    const Vector a = x[1] - x[0], b = x[2] - x[0];
+    across = {Vector(b.y(), -b.x()), Vector(-a.y(), a.x())};
     six_volumes = a.dot(across[0]);
   } else {
-    const Vec<dim> a = x[1] - x[0], b = x[2] - x[0], c = x[3] - x[0];
+    const Vector a = x[1] - x[0], b = x[2] - x[0], c = x[3] - x[0];
     across = {b.cross(c), c.cross(a), a.cross(b)};
     six_volumes = a.dot(across[0]);
   }
-  Geometry<dim> g;
+  Geometry<dim, T> g;
   g.volume = six_volumes / (dim == 2 ? 2 : 6);
-  const double inverse = 1 / six_volumes;
+  const T inverse = 1.0 / six_volumes;
   g.grad_l[0].setZero();
   for (int k = 0; k < dim; ++k) g.grad_l[k + 1] = inverse * across[k], g.grad_l[0] -= g.grad_l[k + 1];
   return g;
@@ -149,5 +154,8 @@ const auto& quadrature() {
   }();
   return points;
 }
+
+template <int dim, int order>
+constexpr int quadrature_count = std::tuple_size_v<std::remove_cvref_t<decltype(quadrature<dim, order>())>>;
 
 }  // namespace quicksand::fluid

@@ -185,8 +185,10 @@ class Fluid {
   std::vector<double> solve_step(double t, const TimeWeights& time, Report& report);
   void hold(double t);
   void evaluate_outside(double t);
-  template <int order>
-  ElementInput<dim, order> input(int element) const;
+  template <int order, class T>
+  struct Input;  // of an element, or of as many as T has lanes
+  template <int order, class T>
+  void gather(std::span<const int> elements, Input<order, T>& to) const;
   std::vector<Vec<dim>> eps_slopes() const;
   std::vector<Vec<dim>> subscales(const std::vector<double>& x, const TimeWeights& time) const;
   void keep_advance();
@@ -196,8 +198,8 @@ class Fluid {
   template <class Use>
   void each_open_point(Use&& use, int steps_ago = 0) const;
   double yield_at(const std::array<int, dim + 1>& corners, const Barycentric<dim>& l) const;
-  template <int order>
-  void scatter(int local, const ElementSystem<dim, order>& system);
+  template <int order, class T>
+  void scatter(int local, int lane, const ElementSystem<dim, order, T>& system);
   template <int order>
   void assemble(const TimeWeights& time, bool newton);
   template <int order>
@@ -256,7 +258,7 @@ class Fluid {
   std::array<std::vector<double>, 2> x_;           // unknowns, Cartesian, after the last step and the one before
   std::vector<Vec<dim>> eps_slope_;                // order 1: grad eps at the nodes, for the coming step [1/m]
   std::array<std::vector<Vec<dim>>, 2> subscale_;  // order 1: at quadrature points, after the last step and the one before [m/s]
-  std::vector<Residual<dim>> residual_;            // order 1: of the last system at quadrature points; empty where subscales() has to find it
+  std::vector<Residual<dim, Lanes>> residual_;     // order 1: of the last system at quadrature points; empty where subscales() has to find it
   std::vector<Vec<dim>> advance_;                  // with grains_follow: dt a of the last step at quadrature points [m]
   std::vector<double> guess_;                      // that advects
   std::array<double, 3> pore_volume_{};            // int eps: now, and one and two steps ago [m^dim]
