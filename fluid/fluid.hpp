@@ -210,24 +210,27 @@ class Fluid {
   template <class Use>
   void loads(const char* function, const std::string& boundary, Use&& use) const;
   std::vector<int> node_numbers() const;
+  template <class T = double>
   struct InElement {
-    Vec<dim> u;        // [m/s]
-    Mat<dim> stress;   // 2 eta D(u) [Pa]
-    double eps;
-    Mat<dim> slope;    // d u_i/d x_j [1/s]
+    VecOf<dim, T> u;       // [m/s]
+    Mat<dim, T> stress;    // 2 eta D(u) [Pa]
+    T eps;
+    Mat<dim, T> slope;     // d u_i/d x_j [1/s]
   };
-  template <int order>
-  struct AtNodes {  // of an element
-    std::array<double, shape_count<dim, order>> eps;
-    std::array<Vec<dim>, shape_count<dim, order>> flux;
+  template <int order, class T>
+  struct AtNodes {  // of an element, or of as many as T has lanes
+    std::array<T, shape_count<dim, order>> eps;
+    std::array<VecOf<dim, T>, shape_count<dim, order>> flux;
+    std::array<VecOf<dim, T>, dim + 1> x, mesh_velocity;
+    std::array<T, dim + 1> pressure;
   };
-  template <int order>
-  AtNodes<order> at_nodes(int element) const;
-  template <int order>
-  InElement flow_at(const AtNodes<order>& nodes, const Barycentric<dim>& l, const Geometry<dim>& g) const;
+  template <int order, class T>
+  AtNodes<order, T> at_nodes(int first, int count) const;
+  template <int order, class T>
+  InElement<T> flow_at(const AtNodes<order, T>& nodes, const Barycentric<dim>& l, const Geometry<dim, T>& g) const;
   template <int order>
   Vec<dim> velocity_at(int element, const Barycentric<dim>& l, int steps_ago) const;
-  InElement flow_in(int element, const Barycentric<dim>& l, const Geometry<dim>& g) const;
+  InElement<> flow_in(int element, const Barycentric<dim>& l, const Geometry<dim>& g) const;
   double pressure_in(int element, const Barycentric<dim>& l, int steps_ago = 0) const;
   Vec<dim> pressure_slope(int element, const Geometry<dim>& g, int steps_ago = 0) const;
   Vec<dim> mesh_velocity_at(int node) const;

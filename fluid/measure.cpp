@@ -96,7 +96,7 @@ void Fluid<dim>::loads(const char* function, const std::string& boundary, Use&& 
     along<dim>(facet, [&](const Barycentric<dim>& l, double weight) {
       Vec<dim> x = Vec<dim>::Zero();
       for (int a = 0; a <= dim; ++a) x += l[a] * position_[corners[a]];
-      const InElement there = flow_in(facet.element, l, facet.geometry);
+      const InElement<> there = flow_in(facet.element, l, facet.geometry);
       use(x, Vec<dim>(weight * (pressure_in(facet.element, l) * facet.area - (1 - there.eps) * (there.stress * facet.area))));
     });
   }
@@ -216,35 +216,49 @@ double Fluid<dim>::yield_at(const std::array<int, dim + 1>& corners, const Baryc
 }
 
 template <int dim>
-template <int order>
-[[gnu::always_inline]] inline auto Fluid<dim>::flow_at(const AtNodes<order>& nodes, const Barycentric<dim>& l, const Geometry<dim>& g) const -> InElement {
-  double eps = 0.0;
-  Vec<dim> flux = Vec<dim>::Zero(), grad_eps = Vec<dim>::Zero();
-  Mat<dim> slope = Mat<dim>::Zero();
+template <int order, class T>
+[[gnu::always_inline]] inline auto Fluid<dim>::flow_at(const AtNodes<order, T>& nodes, const Barycentric<dim>& l, const Geometry<dim, T>& g) const -> InElement<T> {
+  using Vector = VecOf<dim, T>;
+  using Matrix = Mat<dim, T>;
+  T eps = 0.0;
+  Vector flux = Vector::Zero(), grad_eps = Vector::Zero();
+  Matrix slope = Matrix::Zero();
   const auto shape = shapes<dim, order>(l);
-  const auto grad = shape_gradients<dim, order>(l, g.grad_l);
+  const auto grad = shape_gradients<dim, order, T>(l, g.grad_l);
   for (int a = 0; a < shape_count<dim, order>; ++a) {
     eps += shape[a] * nodes.eps[a], grad_eps += nodes.eps[a] * grad[a];
     flux += shape[a] * nodes.flux[a], slope += nodes.flux[a] * grad[a].transpose();
   }
-  const double inv_eps = 1 / eps;
-  const Vec<dim> u = inv_eps * flux;
-  slope = inv_eps * (slope - u * grad_eps.transpose());
+  const T inv_eps = 1.0 / eps;
+  const Vector u = inv_eps * flux;
+  slope = (inv_eps * (slope - u * grad_eps.transpose())).eval();
   return {u, properties.viscosity * (slope + slope.transpose()), eps, slope};
 }
 
+// One element to a lane, from `first` on; lanes beyond `count` repeat the last.
 template <int dim>
-template <int order>
-[[gnu::always_inline]] inline auto Fluid<dim>::at_nodes(int element) const -> AtNodes<order> {
-  AtNodes<order> at;
-  const int* node = &space_.node_of[element * shape_count<dim, order>];
-  for (int a = 0; a < shape_count<dim, order>; ++a) at.eps[a] = eps_[1][node[a]], at.flux[a] = Eigen::Map<const Vec<dim>>(&x_[0][space_.first_dof[node[a]]]);
+template <int order, class T>
+[[gnu::always_inline]] inline auto Fluid<dim>::at_nodes(int first, int count) const -> AtNodes<order, T> {
+  constexpr int n = shape_count<dim, order>;
+  AtNodes<order, T> at;
+  for (int lane = 0; lane < lanes_of<T>; ++lane) {
+    const std::size_t element = first + std::min(lane, count - 1);
+    for (int a = 0; a < n; ++a) {
+      const int node = space_.node_of[element * n + a];
+      put(at.eps[a], lane, eps_[1][node]), put(at.flux[a], lane, Eigen::Map<const Vec<dim>>(&x_[0][space_.first_dof[node]]));
+    }
+    for (int a = 0; a <= dim; ++a) {
+      const int k = mesh_->elements[element][a];
+      put(at.x[a], lane, position_[k]), put(at.mesh_velocity[a], lane, mesh_velocity_[k]);
+      put(at.pressure[a], lane, x_[0][space_.pressure_dof(space_.vertex[k])]);
+    }
+  }
   return at;
 }
 
 template <int dim>
-auto Fluid<dim>::flow_in(int element, const Barycentric<dim>& l, const Geometry<dim>& g) const -> InElement {
-  return velocity_order() == 1 ? flow_at<1>(at_nodes<1>(element), l, g) : flow_at<2>(at_nodes<2>(element), l, g);
+auto Fluid<dim>::flow_in(int element, const Barycentric<dim>& l, const Geometry<dim>& g) const -> InElement<> {
+  return velocity_order() == 1 ? flow_at<1>(at_nodes<1, double>(element, 1), l, g) : flow_at<2>(at_nodes<2, double>(element, 1), l, g);
 }
 
 template <int dim>
@@ -252,27 +266,38 @@ auto Fluid<dim>::projected(bool convection) const -> Projected {
   const std::vector<Vec<dim>> none(space_.nodes(), Vec<dim>::Zero());
   Projected sum{none, none, none, convection ? none : std::vector<Vec<dim>>{}};
   with_order(velocity_order(), [&]<int order>(std::integral_constant<int, order>) {
-    for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
-      const auto& corners = mesh_->elements[e];
-      const Geometry<dim> g = geometry<dim>(position_, corners);
-      std::array<Vec<dim>, dim + 1> velocity;
-      velocity.fill(Vec<dim>::Zero());
-      Mat<dim> stress = Mat<dim>::Zero();
-      const auto nodes = at_nodes<order>(static_cast<int>(e));
+    using T = std::conditional_t<order == 1, Lanes, double>;
+    using Vector = VecOf<dim, T>;
+    const int elements = static_cast<int>(mesh_->elements.size());
+    for (int first = 0; first < elements; first += lanes_of<T>) {
+      const int count = std::min(lanes_of<T>, elements - first);
+      const auto nodes = at_nodes<order, T>(first, count);
+      const Geometry<dim, T> g = geometry<dim, T>(nodes.x);
+      std::array<Vector, dim + 1> velocity, convected;
+      velocity.fill(Vector::Zero()), convected.fill(Vector::Zero());
+      Mat<dim, T> stress = Mat<dim, T>::Zero();
       for (const auto& point : quadrature<dim, order>()) {
-        const InElement there = flow_at<order>(nodes, point.l, g);
-        const double weight = point.weight * g.volume;
+        const InElement<T> there = flow_at<order, T>(nodes, point.l, g);
+        const T weight = point.weight * g.volume;
         for (int a = 0; a <= dim; ++a) velocity[a] += weight * point.l[a] * there.u;
         stress += weight * there.stress;
         if (!convection) continue;
-        Vec<dim> relative = there.u;
-        for (int a = 0; a <= dim; ++a) relative -= point.l[a] * mesh_velocity_[corners[a]];
-        for (int a = 0; a <= dim; ++a) sum.convection[space_.vertex[corners[a]]] += weight * point.l[a] * there.slope * relative;
+        Vector relative = there.u;
+        for (int a = 0; a <= dim; ++a) relative -= point.l[a] * nodes.mesh_velocity[a];
+        for (int a = 0; a <= dim; ++a) convected[a] += weight * point.l[a] * there.slope * relative;
       }
-      const Vec<dim> grad_p = g.volume / (dim + 1) * pressure_slope(static_cast<int>(e), g);
+      Vector grad_p = Vector::Zero();
+      for (int a = 0; a <= dim; ++a) grad_p += nodes.pressure[a] * g.grad_l[a];
+      grad_p *= g.volume / (dim + 1.0);
       for (int a = 0; a <= dim; ++a) {
-        const int node = space_.vertex[corners[a]];
-        sum.velocity[node] += velocity[a], sum.pressure_gradient[node] += grad_p, sum.viscous_force[node] -= stress * g.grad_l[a];
+        const Vector viscous = -stress * g.grad_l[a];
+        for (int lane = 0; lane < count; ++lane) {
+          const int node = space_.vertex[mesh_->elements[first + lane][a]];
+          for (int i = 0; i < dim; ++i) {
+            sum.velocity[node][i] += get(velocity[a][i], lane), sum.pressure_gradient[node][i] += get(grad_p[i], lane), sum.viscous_force[node][i] += get(viscous[i], lane);
+            if (convection) sum.convection[node][i] += get(convected[a][i], lane);
+          }
+        }
       }
     }
     for (std::size_t f = 0; f < mesh_->facets.size(); ++f) {
@@ -304,7 +329,7 @@ Vec<dim> Fluid<dim>::momentum_residual() const {
   for (int node = 0; node < space_.nodes(); ++node) {
     const Held& held = held_[node];
     Vec<dim> left = held.frame.transpose() * Eigen::Map<const Vec<dim>>(&reaction_at_nodes_[space_.first_dof[node]]);
-    left.head(held.last).setZero();
+    for (int axis = 0; axis < held.last; ++axis) left[axis] = 0.0;
     sum += held.frame * left;
   }
   return sum;
