@@ -65,7 +65,8 @@ void Fluid<dim>::judge_elements(Report& report, const std::vector<double>& x, do
       if (a <= dim) u += (Eigen::Map<const Vec<dim>>(&x[space_.first_dof[node]]) / eps_[0][node] - mesh_velocity_[mesh_->elements[e][a]]) / (dim + 1);
     }
     report.eps_jump = std::max(report.eps_jump, (most - least) / least);
-    const double per_time = u.dot(metric(geometry<dim>(position_, mesh_->elements[e])) * u) / 4;  // (|u|/h)^2
+    double per_time = 0.0;  // (|u|/h)^2 = u . m u/4, m the element's metric
+    for (const Vec<dim>& grad : geometry<dim>(position_, mesh_->elements[e]).grad_l) per_time += 0.5 * grad.dot(u) * grad.dot(u);
     courant = std::max(courant, per_time);
     if (per_time > 0) peclet = std::max(peclet, u.squaredNorm() * u.squaredNorm() / per_time);
   }

@@ -26,34 +26,50 @@ std::vector<double> Fluid<dim>::eps_change(double dt) const {
   std::vector<double> change(space_.nodes(), 0.0);
   const bool moves = std::any_of(mesh_velocity_.begin(), mesh_velocity_.end(), [](const Vec<dim>& w) { return !w.isZero(0.0); });
   auto sum = [&]<int order>(std::integral_constant<int, order>) {
+    using T = std::conditional_t<order == 1, Lanes, double>;
+    using Vector = VecOf<dim, T>;
     constexpr int n = shape_count<dim, order>;
-    for (std::size_t e = 0; e < mesh_->elements.size(); ++e) {
-      const auto& corners = mesh_->elements[e];
-      const int* node = &space_.node_of[e * n];
+    const int elements = static_cast<int>(mesh_->elements.size());
+    for (int first = 0; first < elements; first += lanes_of<T>) {
+      const int count = std::min(lanes_of<T>, elements - first);
+      std::array<Vector, dim + 1> before, now, velocity;
+      std::array<T, n> eps, eps_before;
+      for (int lane = 0; lane < lanes_of<T>; ++lane) {
+        const std::size_t e = first + std::min(lane, count - 1);
+        for (int a = 0; a <= dim; ++a) {
+          const int k = mesh_->elements[e][a];
+          put(before[a], lane, old_position_[k]), put(now[a], lane, position_[k]), put(velocity[a], lane, mesh_velocity_[k]);
+        }
+        for (int a = 0; a < n; ++a) put(eps[a], lane, eps_[0][space_.node_of[e * n + a]]), put(eps_before[a], lane, eps_[1][space_.node_of[e * n + a]]);
+      }
+      std::array<T, dim + 1> of_corners;
+      of_corners.fill(0.0);
       auto integrate = [&](double share, auto&& rate) {  // on the mesh at old + share (new - old)
-        std::array<Vec<dim>, dim + 1> x;
-        for (int a = 0; a <= dim; ++a) x[a] = (1 - share) * old_position_[corners[a]] + share * position_[corners[a]];
-        const Geometry<dim> g = geometry<dim>(x);
+        std::array<Vector, dim + 1> x;
+        for (int a = 0; a <= dim; ++a) x[a] = (1 - share) * before[a] + share * now[a];
+        const Geometry<dim, T> g = geometry<dim, T>(x);
         for (const auto& point : quadrature<dim, order>()) {
-          const double value = rate(point, g) * point.weight * g.volume;
-          for (int a = 0; a <= dim; ++a) change[node[a]] += point.l[a] * value;
+          const T value = rate(point, g) * point.weight * g.volume;
+          for (int a = 0; a <= dim; ++a) of_corners[a] += point.l[a] * value;
         }
       };
       integrate(0.0, [&](const auto& point, const auto&) {
         const auto shape = shapes<dim, order>(point.l);
-        double d = 0.0;
-        for (int a = 0; a < n; ++a) d += shape[a] * (eps_[0][node[a]] - eps_[1][node[a]]);
+        T d = 0.0;
+        for (int a = 0; a < n; ++a) d += shape[a] * (eps[a] - eps_before[a]);
         return d;
       });
       if (moves)
         for (const double side : {-1.0, 1.0})  // Gauss: exact for the cubic polynomial in time
-          integrate(0.5 + side * 0.5 / std::sqrt(3.0), [&](const auto& point, const Geometry<dim>& g) {
-            const auto grad = shape_gradients<dim, order>(point.l, g.grad_l);
-            Vec<dim> slope = Vec<dim>::Zero(), w = Vec<dim>::Zero();
-            for (int a = 0; a < n; ++a) slope += eps_[0][node[a]] * grad[a];
-            for (int a = 0; a <= dim; ++a) w += point.l[a] * mesh_velocity_[corners[a]];
-            return -0.5 * dt * w.dot(slope);
+          integrate(0.5 + side * 0.5 / std::sqrt(3.0), [&](const auto& point, const Geometry<dim, T>& g) {
+            const auto grad = shape_gradients<dim, order, T>(point.l, g.grad_l);
+            Vector slope = Vector::Zero(), w = Vector::Zero();
+            for (int a = 0; a < n; ++a) slope += eps[a] * grad[a];
+            for (int a = 0; a <= dim; ++a) w += point.l[a] * velocity[a];
+            return T(-0.5 * dt * w.dot(slope));
           });
+      for (int lane = 0; lane < count; ++lane)
+        for (int a = 0; a <= dim; ++a) change[space_.node_of[(first + lane) * n + a]] += get(of_corners[a], lane);
     }
   };
   with_order(velocity_order(), sum);

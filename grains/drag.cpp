@@ -2,6 +2,7 @@
 #include "impulse.hpp"
 #include "simulation.hpp"
 
+#include <algorithm>
 #include <numeric>
 
 namespace quicksand {
@@ -72,7 +73,10 @@ std::vector<std::uint8_t> Simulation<dim>::held() const {
     while (root[k] != k) k = root[k] = root[root[k]];
     return k;
   };
-  auto join = [&](int a, int b) { root[std::max(find(a), find(b))] = std::min(find(a), find(b)); };
+  auto join = [&](int a, int b) {
+    const auto [first, last] = std::minmax({find(a), find(b)});
+    root[last] = first;
+  };
   for (int k = 0; k < n; ++k)
     if (grains_.wall[k] >= 0) join(k, n + grains_.wall[k]);
   std::vector<std::uint8_t> stiff(walls_.size(), 0), leans(n, 0);
