@@ -22,13 +22,21 @@ double seconds() { return std::chrono::duration<double>(std::chrono::steady_cloc
 DragLaw of_each(Eight (*law)(const Suspensions&)) {
   return [law](std::span<const Suspension> s, std::span<double> gamma) {
     for (std::size_t from = 0; from < s.size(); from += 8) {
-      Suspensions eight;
-      for (int k = 0; k < 8; ++k) {
-        const Suspension& one = s[std::min(from + k, s.size() - 1)];
-        eight.diameter[k] = one.diameter, eight.eps[k] = one.eps, eight.slip[k] = one.slip, eight.density[k] = one.density, eight.viscosity[k] = one.viscosity;
+      const std::size_t count = std::min<std::size_t>(8, s.size() - from);
+      std::array<Suspension, 8> last;
+      const Suspension* at = &s[from];
+      if (count < 8) {
+        last.fill(s.back()), std::copy_n(at, count, last.begin());
+        at = last.data();
       }
+      Suspensions eight;
+      for (int k = 0; k < 8; ++k) eight.diameter[k] = at[k].diameter;
+      for (int k = 0; k < 8; ++k) eight.eps[k] = at[k].eps;
+      for (int k = 0; k < 8; ++k) eight.slip[k] = at[k].slip;
+      for (int k = 0; k < 8; ++k) eight.density[k] = at[k].density;
+      for (int k = 0; k < 8; ++k) eight.viscosity[k] = at[k].viscosity;
       const Eight here = law(eight);
-      std::copy_n(here.data(), std::min<std::size_t>(8, s.size() - from), gamma.begin() + from);
+      std::copy_n(here.data(), count, gamma.begin() + from);
     }
   };
 }
@@ -79,11 +87,12 @@ void Coupling<dim>::set_outlet(const std::string& boundary) {
 
 template <int dim>
 void Coupling<dim>::take_grains() {
-  x_ = grains_.by_id([&](const Grains<dim>& g, int k) { return walker_.wrap(g.x[k]); });
-  v_ = grains_.by_id([](const Grains<dim>& g, int k) { return Vec<dim>(g.body[k].v); });
-  r_ = grains_.by_id([](const Grains<dim>& g, int k) { return g.r[k]; });
-  m_ = grains_.by_id([](const Grains<dim>& g, int k) { return 1.0 / g.body[k].inv_m; });
-  const std::size_t n = x_.size();
+  const std::size_t n = grains_.count();
+  x_.resize(n), v_.resize(n), r_.resize(n), m_.resize(n);
+  grains_.each([&](int id, const Grains<dim>& g, int k) {
+    x_[id] = walker_.wrap(g.x[k]), v_[id] = g.body[k].v;
+    r_[id] = g.r[k], m_[id] = 1.0 / g.body[k].inv_m;
+  });
   carry_.resize(n, Vec<dim>::Zero()), free_.resize(n, false), held_.resize(n, 255), place_.resize(n), drag_.resize(n), answer_.resize(n);  // new grains
 }
 
@@ -92,7 +101,7 @@ template <int dim>
 void Coupling<dim>::locate() {
   std::vector<int> gone;
   for (std::size_t i = 0; i < x_.size(); ++i) {
-    place_[i] = walker_.find(x_[i], place_[i]);
+    walker_.find(x_[i], place_[i]);
     if (place_[i].left_by < 0) continue;
     if (!outlet_[place_[i].left_by])
       fail("Coupling: grain {} at {} m is outside the mesh, beyond boundary \"{}\". Grains need a wall there, or call outlet(\"{}\") to let them go", i, place(x_[i]),
@@ -399,7 +408,8 @@ Report<dim> Coupling<dim>::step(double dt) {
   }
   expect_drag(dt);
   answer_as_expected(dt);
-  u_before_ = u_, u_mean_before_ = u_mean_, grad_p_before_ = grad_p_;
+  auto keep = [&](auto& before, auto& now) { settings.fluid_moves ? before.swap(now) : void(before = now); };  // tell_grains() makes them anew
+  keep(u_before_, u_), keep(u_mean_before_, u_mean_), keep(grad_p_before_, grad_p_);
   const bool again = settings.fluid_moves && settings.grains_move && std::isfinite(settings.tolerance);
   if (again) fluid_.mark();
   const std::vector<char> grains_before = again ? grains_.state() : std::vector<char>{};

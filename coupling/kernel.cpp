@@ -237,7 +237,8 @@ auto Kernel<dim>::weights_at(std::span<const Vec<dim>> x) const -> Points {
         Eigen::Map<Eigen::Array4d>(b + k) = here;
         met += here;
       }
-    Eigen::Map<Eigen::Array<double, splines, 1>>(b + 0) *= 1 / met.sum();
+    const double all = 1 / met.sum();
+    for (int k = 0; k < splines; k += 4) Eigen::Map<Eigen::Array4d>(b + k) *= all;  // as they were stored: longer ones would wait for memory
   }
   return points;
 }

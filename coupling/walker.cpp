@@ -44,8 +44,8 @@ Vec<dim> Walker<dim>::wrap(Vec<dim> x) const {
 }
 
 template <int dim>
-Place<dim> Walker<dim>::find(const Vec<dim>& x, const Place<dim>& before) {
-  Place<dim> now{.element = before.element, .l = {}, .left_by = -1};
+void Walker<dim>::find(const Vec<dim>& x, Place<dim>& now) {
+  now.left_by = -1;
   int boundary = -1;
   for (int steps = 0; steps < 200; ++steps) {  // a walk may go round in circles on slender elements: then the grid decides
     const auto& corners = mesh_->elements[now.element];
@@ -55,7 +55,7 @@ Place<dim> Walker<dim>::find(const Vec<dim>& x, const Place<dim>& before) {
       now.l[a] = 1.0 + g.grad_l[a].dot(x - nodes_[corners[a]]);
       if (now.l[a] < now.l[lowest]) lowest = a;
     }
-    if (now.l[lowest] >= 0) return now;
+    if (now.l[lowest] >= 0) return;
     const int next = across_[now.element][lowest];
     if (next < 0) {
       boundary = -1 - next;
@@ -64,9 +64,8 @@ Place<dim> Walker<dim>::find(const Vec<dim>& x, const Place<dim>& before) {
     now.element = next;
   }
   if (!locator_) locator_.emplace(*mesh_, nodes_);
-  if (const auto found = locator_->find(x)) return {.element = found->first, .l = found->second, .left_by = -1};
-  now.left_by = std::max(boundary, 0);
-  return now;
+  if (const auto found = locator_->find(x)) now.element = found->first, now.l = found->second;
+  else now.left_by = std::max(boundary, 0);
 }
 
 template class Walker<2>;

@@ -29,7 +29,7 @@ class Walker {
   // The point moved by whole periods into those of the mesh.
   Vec<dim> wrap(Vec<dim> x) const;
   // From where it was, x wrapped.
-  Place<dim> find(const Vec<dim>& x, const Place<dim>& before);
+  void find(const Vec<dim>& x, Place<dim>& now);
 
  private:
   std::shared_ptr<const Mesh<dim>> mesh_;

@@ -245,12 +245,17 @@ std::vector<double> Fluid<dim>::solve(const char* function, const std::vector<do
   std::array<double, 2> size{};  // of the momentum's diagonal, and of what pressures do to it
   for (int r = 0; r < own; ++r) {
     if (is_pressure[space_.begin + r]) continue;
+    double of_row = 0.0;
     for (int k = space_.row_start[r]; k < space_.row_start[r + 1]; ++k)
       if (space_.column[k] == space_.begin + r) size[0] += std::abs(values[k]);
-      else if (is_pressure[space_.column[k]]) size[1] += std::abs(values[k]);
+      else if (is_pressure[space_.column[k]]) of_row += std::abs(values[k]);
+    size[1] += of_row;
   }
   sum_over_ranks(size);
   const double pressure_scale = pressure_scale_ = size[0] / size[1];
+  std::vector<double> scale(space_.dofs());
+  for (int k = 0; k < space_.dofs(); ++k) scale[k] = is_pressure[k] ? pressure_scale : 1.0;
+  const bool any_frame = std::find(has_frame_.begin(), has_frame_.end(), true) != has_frame_.end();
   for (int node = 0; node < space_.nodes(); ++node) {
     if (!space_.mine(node)) continue;
     const int first = space_.first_dof[node] - space_.begin, length = space_.row_start[first + 1] - space_.row_start[first];
@@ -269,16 +274,14 @@ std::vector<double> Fluid<dim>::solve(const char* function, const std::vector<do
         missing[first + i] = 0.0;
         continue;
       }
-      for (int k = 0; k < length; ++k) {
+      for (int k = 0; k < length && any_frame; ++k) {
         const int other = space_.node_at[columns[k]];
-        if (other >= 0 && has_frame_[other]) {
-          Eigen::Map<Eigen::Matrix<double, 1, dim>> block(&rows[k]);
-          block = (block * held_[other].frame).eval();
-        }
-        if (is_pressure[columns[k]]) rows[k] *= pressure_scale;
-        if (i == dim) rows[k] *= pressure_scale;
+        if (other < 0 || !has_frame_[other]) continue;
+        Eigen::Map<Eigen::Matrix<double, 1, dim>> block(&rows[k]);
+        block = (block * held_[other].frame).eval();
       }
-      if (i == dim) missing[first + i] *= pressure_scale;
+      for (int k = 0; k < length; ++k) rows[k] *= scale[row] * scale[columns[k]];
+      missing[first + i] *= scale[row];
     }
   }
   if (!solver_) {

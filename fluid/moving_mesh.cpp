@@ -170,6 +170,7 @@ std::vector<Vec<dim>> Fluid<dim>::harmonic(const std::vector<std::vector<int>>& 
     if (harmonic_->held[axis].rows() == 0) continue;
     Eigen::VectorXd known(space_.nodes());
     for (int node = 0; node < space_.nodes(); ++node) known[node] = at_node[node][axis];
+    if (known.isZero(0.0)) continue;
     const Eigen::VectorXd found = harmonic_->factors[axis].solve(-(harmonic_->held[axis] * known));
     for (int node = 0; node < space_.nodes(); ++node)
       if (harmonic_->row[axis][node] >= 0) at_node[node][axis] = found[harmonic_->row[axis][node]];

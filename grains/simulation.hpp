@@ -132,9 +132,13 @@ class Simulation {
   template <class Get>
   auto by_id(Get&& get) const {
     std::vector<std::decay_t<decltype(get(grains_, 0))>> out(n_free_);
-    for (int k = 0; k < grains_.size(); ++k)
-      if (grains_.id[k] >= 0) out[grains_.id[k]] = get(grains_, k);
+    each([&](int id, const Grains<dim>& grains, int k) { out[id] = get(grains, k); });
     return out;
+  }
+  template <class Use>
+  void each(Use&& use) const {  // use(id, grains, index), in the order of space
+    for (int k = 0; k < grains_.size(); ++k)
+      if (grains_.id[k] >= 0) use(grains_.id[k], grains_, k);
   }
   void set_position(std::span<const Vec<dim>> x);
   void set_velocity(std::span<const Vec<dim>> v);
