@@ -148,7 +148,7 @@ def simulate(scene, flags):
         lower, upper = scene.walls
         plates = [scene.flow.force(name)[0] for name in ("bottom", "top")]
         run.record(**{name: getattr(report, name) for name in BALANCES}, **{f"{name}_time": getattr(report, f"{name}_time") for name in SHARES},
-                   mean_drag=np.linalg.norm(scene.both.drag_force, axis=1).mean(), cell_height=scene.cell_height,
+                   mean_drag=np.hypot(*scene.both.drag_force.T).mean(), cell_height=scene.cell_height,
                    drained=flags.dt * (scene.flow.flux("bottom") + scene.flow.flux("top")),
                    plate_shear_traction=(lower.force[0] + plates[0] - upper.force[0] - plates[1]) / (2 * flags.width))
         if run.samples % PROFILE_EVERY == 0:

@@ -170,7 +170,7 @@ class Simulation {
   Motion measure_pairs();
   void repair_overlaps(double allowed);
   double speed_of_missed(double h, double speed, double alert, double wall_alert) const;
-  double sub_step_length(double left, double dt, const Motion& motion) const;
+  double sub_step_length(double left, double dt, const Motion& motion, double gain) const;  // gain: speed_gain(left)
   void find_contacts(double h, double alert, double wall_alert);
   void join_facets(double wall_alert);
   Problem<dim> problem();

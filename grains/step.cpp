@@ -46,7 +46,12 @@ StepReport<dim> Simulation<dim>::step(double dt) {
 
   for (double left = dt; left > 0;) {
     Motion motion = measure_pairs();
-    double h = sub_step_length(left, dt, motion), gain = speed_gain(h);
+    double h, gain;
+    auto choose = [&] {
+      gain = speed_gain(left), h = sub_step_length(left, dt, motion, gain);
+      if (h != left) gain = speed_gain(h);
+    };
+    choose();
     // How near a pair must be to touch in this sub-step: half as much again as the fastest of all neighbours moves relative to another,
     // for a grain may be pushed faster than any moved before. Pairs that are no neighbours yet must not come that near, by
     // their own motion and half of that.
@@ -54,7 +59,7 @@ StepReport<dim> Simulation<dim>::step(double dt) {
     if (!neighbours_.valid(grains_, walls_, alert(motion.speed) / 3, h, threads_)) {
       neighbours_.find(grains_, walls_, box_, std::clamp(3 * alert(motion.speed), skin * mean_radius_, max_radius_ * 2), threads_);
       motion = measure_pairs();
-      h = sub_step_length(left, dt, motion), gain = speed_gain(h);
+      choose();
       while (!neighbours_.valid(grains_, walls_, alert(motion.speed) / 3, h, threads_)) h *= 0.5, gain = speed_gain(h);
     }
     const double overlap = motion.overlap, allowed = repair_above * settings.solve.tolerance * 2 * mean_radius_;
@@ -353,11 +358,11 @@ double Simulation<dim>::speed_of_missed(double h, double speed, double alert, do
 // The linearised gap underestimates the gap of convex bodies that slide past each other, by (u_t h)^2/(2 d): a sub-step that
 // lets a pair move by a fraction f of its centres' distance opens gaps of f^2/2 of it, and never makes an overlap.
 template <int dim>
-double Simulation<dim>::sub_step_length(double left, double dt, const Motion& motion) const {
+double Simulation<dim>::sub_step_length(double left, double dt, const Motion& motion, double gain) const {
   if (grains_.size() == 0) return left;
   double parts = 1.0;
   if (settings.sub_steps == SubSteps::relative) {
-    const double rate = motion.rate + speed_gain(left) / (2 * mean_radius_);
+    const double rate = motion.rate + gain / (2 * mean_radius_);
     parts = std::ceil(left * rate / settings.sub_step_motion);
   } else {
     double v2_max = 0.0, r_min = std::numeric_limits<double>::infinity();
