@@ -65,7 +65,7 @@ Coupling<dim>::Coupling(Simulation<dim>& grains, fluid::Fluid<dim>& fluid, Setti
     // have to be new in most steps. What it leaves open is momentum lost.
     if (!fluid_.settings.linear) {
       const bool ilu = fluid_.velocity_order() == 1 && (dim == 3 || fluid_.space().dofs() < 20000);
-      fluid_.settings.linear = fluid::LinearSettings{.method = ilu ? fluid::Method::ilu : dim == 2 ? fluid::Method::direct : fluid::Method::fieldsplit};
+      fluid_.settings.linear = fluid::LinearSettings{.method = ilu ? fluid::Method::ilu : dim == 2 ? fluid::Method::direct : fluid::Method::fieldsplit, .fill_levels = dim == 2};
     }
     fluid_.settings.linear->tolerance = 1e-13;
     fluid_.grains_follow = settings.grains_move;

@@ -132,6 +132,7 @@ LinearSolver::LinearSolver(int begin, int end, int size, const std::vector<int>&
     PETSC(MatMumpsSetIcntl(factors, 14, 200));
   } else if (settings.method == Method::ilu) {
     PETSC(PCSetType(pc, ranks() == 1 ? PCILU : PCBJACOBI));
+    PETSC(PCFactorSetLevels(pc, settings.fill_levels));  // nothing where pc is none that factorises
   } else {
     PETSC(KSPSetType(s_->ksp, KSPFGMRES));
     PETSC(PCSetType(pc, PCFIELDSPLIT));

@@ -30,6 +30,7 @@ struct LinearSettings {
   Method method = Method::direct;
   double tolerance = 1e-11;     // on the residual, preconditioned, relative to the first one of this system or of recent ones [-]
   int max_iterations = 1000;
+  int fill_levels = 0;          // of ILU, on one process
   int most_with_old_factors = 16;  // iterations: more, and the next matrix is factorised anew
 };
 
