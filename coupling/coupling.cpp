@@ -93,7 +93,7 @@ void Coupling<dim>::take_grains() {
     x_[id] = walker_.wrap(g.x[k]), v_[id] = g.body[k].v;
     r_[id] = g.r[k], m_[id] = 1.0 / g.body[k].inv_m;
   });
-  carry_.resize(n, Vec<dim>::Zero()), free_.resize(n, false), held_.resize(n, 255), place_.resize(n), drag_.resize(n), answer_.resize(n);  // new grains
+  carry_.resize(n, Vec<dim>::Zero()), free_.resize(n, false), follows_fluid_.resize(n, Vec<dim>::Zero()), place_.resize(n), drag_.resize(n), answer_.resize(n);  // new grains
 }
 
 // Where grains are; those that have left through an outlet are taken out.
@@ -118,7 +118,7 @@ void Coupling<dim>::locate() {
       else values[to++] = values[i];
     values.resize(to);
   };
-  keep(x_), keep(v_), keep(r_), keep(m_), keep(carry_), keep(free_), keep(held_), keep(place_), keep(drag_), keep(answer_);
+  keep(x_), keep(v_), keep(r_), keep(m_), keep(carry_), keep(free_), keep(follows_fluid_), keep(place_), keep(drag_), keep(answer_);
 }
 
 // What the flow is and does where each grain is.
@@ -284,9 +284,8 @@ void Coupling<dim>::set_reaction(double dt) {
   for (std::size_t i = 0; i < x_.size(); ++i) {
     const Answer& answer = answer_[i];
     Values values = zero;
-    values.template head<3 * dim + 2>() << answer.beta, answer.yield, answer.beta * (answer.v + drag_[i].shift - u_before_[i]), answer.given + answer.yield * (answer.grad_p - grad_p_before_[i]) + carry_[i] / dt, Vec<dim>::Zero();
-    for (int axis = 0; axis < dim; ++axis)
-      if (!(held_[i] >> axis & 1)) values[2 + 2 * dim + axis] = solid_volume_of(static_cast<int>(i));
+    values.template head<3 * dim + 2>() << answer.beta, answer.yield, answer.beta * (answer.v + drag_[i].shift - u_before_[i]), answer.given + answer.yield * (answer.grad_p - grad_p_before_[i]) + carry_[i] / dt,
+        solid_volume_of(static_cast<int>(i)) * follows_fluid_[i];
     kernel_.give(static_cast<int>(i), values, to_carriers);
   }
   const std::vector<Values> sums = kernel_.to_nodes(to_carriers, zero);
@@ -450,7 +449,9 @@ Report<dim> Coupling<dim>::step(double dt) {
     fluid_.back(), grains_.restore(grains_before);
   }
   carry_ = next_carry;
+  const std::vector<std::uint8_t> held = settings.grains_move ? grains_.held() : std::vector<std::uint8_t>(n, 255);
   for (int i = 0; i < n; ++i) {
+    for (int axis = 0; axis < dim; ++axis) follows_fluid_[i][axis] = held[i] >> axis & 1 ? 0.8 * follows_fluid_[i][axis] : 1.0;
     drag_force_[i] /= dt;
     report.drag += drag_force_[i];
   }
@@ -491,7 +492,6 @@ void Coupling<dim>::move_grains(double dt, Report<dim>& report) {
   report.grains_time += seconds() - stepping;
   sub_steps_ = report.grains.sub_steps;
   drag_force_ = grains_.drag_impulse();
-  held_ = grains_.held();
   const auto& in_contact = grains_.in_contact();
   const auto& contact_impulse = grains_.contact_impulse();
   const auto after = grains_.by_id([](const Grains<dim>& g, int k) { return Vec<dim>(g.body[k].v); });
@@ -506,8 +506,8 @@ template <int dim>
 std::vector<double> Coupling<dim>::state() const {
   std::vector<double> all{static_cast<double>(place_.size()), static_cast<double>(sub_steps_), static_cast<double>(started_), static_cast<double>(removed_)};
   for (std::size_t i = 0; i < place_.size(); ++i) {
-    all.push_back(free_[i]), all.push_back(held_[i]), all.push_back(place_[i].element);
-    all.insert(all.end(), carry_[i].data(), carry_[i].data() + dim);
+    all.push_back(free_[i]), all.push_back(place_[i].element);
+    for (const Vec<dim>& vector : {carry_[i], follows_fluid_[i]}) all.insert(all.end(), vector.data(), vector.data() + dim);
   }
   for (const auto& [boundary, follow] : follows_) all.insert(all.end(), follow->from.data(), follow->from.data() + dim);
   return all;
@@ -515,16 +515,16 @@ std::vector<double> Coupling<dim>::state() const {
 
 template <int dim>
 void Coupling<dim>::restore(std::span<const double> state) {
-  const std::size_t n = grains_.count(), size = 4 + n * (3 + dim) + follows_.size() * dim;
+  const std::size_t n = grains_.count(), size = 4 + n * (2 + 2 * dim) + follows_.size() * dim;
   if (state.size() != size || state[0] != static_cast<double>(n))
     fail("restore: the state has {} numbers where {} grains and {} boundaries that follow walls have {}; restore grains and fluid first, and call follow as "
          "before", state.size(), n, follows_.size(), size);
   const double* at = state.data() + 1;
   sub_steps_ = static_cast<int>(*at++), started_ = *at++ != 0.0, removed_ = static_cast<int>(*at++);
-  free_.resize(n), held_.resize(n), place_.resize(n), carry_.resize(n);
+  free_.resize(n), place_.resize(n), carry_.resize(n), follows_fluid_.resize(n);
   for (std::size_t i = 0; i < n; ++i) {
-    free_[i] = *at++ != 0.0, held_[i] = static_cast<std::uint8_t>(*at++), place_[i].element = static_cast<int>(*at++);
-    carry_[i] = Eigen::Map<const Vec<dim>>(at), at += dim;
+    free_[i] = *at++ != 0.0, place_[i].element = static_cast<int>(*at++);
+    for (Vec<dim>* vector : {&carry_[i], &follows_fluid_[i]}) *vector = Eigen::Map<const Vec<dim>>(at), at += dim;
   }
   for (auto& [boundary, follow] : follows_) follow->from = Eigen::Map<const Vec<dim>>(at), at += dim;
 }

@@ -15,7 +15,8 @@
 // solids up to 0.6, together with Fluid::grains_follow (and 1.3 up to 0.8 of light grains, if they are confined). Three things are needed for that:
 // the target v_0, for a free grain's answer given to a held one is explicit drag, unstable for k > 2; the answer to the pressure, c V; and that
 // continuity knows what follows the fluid: all grains but those that lean on a wall, by whatever chain of contacts. Theirs would be a false alarm
-// that swings on, in a bed with clear fluid above.
+// that swings on, in a bed with clear fluid above. Grains that a wall holds count less by a fifth in each step: at once, a bed that lifts off its screen and falls back, held for some
+// steps and not for the next, was driven on until pressures were a thousand times its weight.
 // Drag sees the flow where the grain is, u_i = u(x_i), and gives it to the fluid by the kernel: -sum_i K_i gamma_i (u_i - v_i). Implicit, that would couple
 // all nodes within a kernel. Its usual short form, beta (u - v), beta = sum gamma_i K_i, couples neighbours only, but drags all of the fluid within a
 // kernel along with a grain that differs from it by shear: a viscosity of beta r_0^2, in dense beds hundreds of times the fluid's. (The mean over the
@@ -162,7 +163,7 @@ class Coupling {
   std::vector<double> r_, m_, eps_at_;
   std::vector<Place<dim>> place_;
   std::vector<char> free_;         // bore no contact in the last step
-  std::vector<std::uint8_t> held_; // by a wall, of each axis a bit
+  std::vector<Vec<dim>> follows_fluid_;            // of each axis: 1, or less where a wall holds the grain
   std::vector<Drag> drag_;
   std::vector<Own> own_;
   std::vector<Answer> answer_;
