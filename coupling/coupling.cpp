@@ -316,12 +316,15 @@ std::vector<Vec<dim>> Coupling<dim>::short_wave_drag() const {
   std::vector<double> gamma(x_.size());
   for (std::size_t i = 0; i < gamma.size(); ++i) gamma[i] = answer_[i].beta;
   const std::vector<double> by_carriers = kernel_.density(gamma), beta = kernel_.at_nodes(by_carriers);
+  const auto at_nodes_over_beta = [&]<class T>(const std::vector<T>& of_carriers) {
+    std::vector<T> f = kernel_.at_nodes(of_carriers);
+    for (std::size_t k = 0; k < f.size(); ++k) f[k] *= beta[k] > 0 ? 1 / beta[k] : 0.0;
+    return f;
+  };
   const auto pass = [&]<class T>(const std::vector<T>& f) {
     std::vector<T> c = kernel_.mean(f);
     for (std::size_t g = 0; g < c.size(); ++g) c[g] *= by_carriers[g];
-    c = kernel_.at_nodes(c);
-    for (std::size_t k = 0; k < c.size(); ++k) c[k] *= beta[k] > 0 ? 1 / beta[k] : 0.0;
-    return c;
+    return at_nodes_over_beta(c);
   };
   const auto less_passed = [&](std::vector<Vec<dim>>& f) {
     const std::vector<Vec<dim>> passed = pass(f);
@@ -346,15 +349,15 @@ std::vector<Vec<dim>> Coupling<dim>::short_wave_drag() const {
   slope = pass(slope);
   for (std::size_t k = 0; k < x.size(); ++k) wave[k] -= slope[k] * shift[k];
   for (int power = 1; power < 3; ++power) less_passed(wave);
+  std::vector<double> beta_at(x_.size());  // grains
   std::vector<Vec<dim>> slip(x_.size()), drag(x_.size());
-  for (std::size_t i = 0; i < x_.size(); ++i) slip[i] = u_before_[i] - v_[i];
+  for (std::size_t i = 0; i < x_.size(); ++i) beta_at[i] = kernel_.at_grain(static_cast<int>(i), by_carriers), slip[i] = u_before_[i] - v_[i];
   for (int round = 0; round < 3; ++round) {
     for (std::size_t i = 0; i < x_.size(); ++i) drag[i] = gamma[i] * slip[i];
-    const std::vector<Vec<dim>> c = kernel_.density(drag), there = kernel_.at_nodes(c);
-    for (std::size_t k = 0; k < x.size(); ++k)
-      if (beta[k] > 0) wave[k] += there[k] / beta[k];
+    const std::vector<Vec<dim>> c = kernel_.density(drag), there = at_nodes_over_beta(c);
+    for (std::size_t k = 0; k < x.size(); ++k) wave[k] += there[k];
     for (std::size_t i = 0; i < x_.size(); ++i)
-      if (const double here = kernel_.at_grain(static_cast<int>(i), by_carriers); here > 0) slip[i] -= kernel_.at_grain(static_cast<int>(i), c) / here;
+      if (beta_at[i] > 0) slip[i] -= kernel_.at_grain(static_cast<int>(i), c) / beta_at[i];
   }
   for (int power = 0; power < 3; ++power) less_passed(wave);
   for (std::size_t k = 0; k < x.size(); ++k) wave[k] *= -beta[k];
@@ -407,8 +410,7 @@ Report<dim> Coupling<dim>::step(double dt) {
   }
   expect_drag(dt);
   answer_as_expected(dt);
-  auto keep = [&](auto& before, auto& now) { settings.fluid_moves ? before.swap(now) : void(before = now); };  // tell_grains() makes them anew
-  keep(u_before_, u_), keep(u_mean_before_, u_mean_), keep(grad_p_before_, grad_p_);
+  u_before_ = u_, u_mean_before_ = u_mean_, grad_p_before_ = grad_p_;
   const bool again = settings.fluid_moves && settings.grains_move && std::isfinite(settings.tolerance);
   if (again) fluid_.mark();
   const std::vector<char> grains_before = again ? grains_.state() : std::vector<char>{};
@@ -449,9 +451,12 @@ Report<dim> Coupling<dim>::step(double dt) {
     fluid_.back(), grains_.restore(grains_before);
   }
   carry_ = next_carry;
-  const std::vector<std::uint8_t> held = settings.grains_move ? grains_.held() : std::vector<std::uint8_t>(n, 255);
+  if (settings.grains_move) {
+    const std::vector<std::uint8_t> held = grains_.held();
+    for (int i = 0; i < n; ++i)
+      for (int axis = 0; axis < dim; ++axis) follows_fluid_[i][axis] = held[i] >> axis & 1 ? 0.8 * follows_fluid_[i][axis] : 1.0;
+  }
   for (int i = 0; i < n; ++i) {
-    for (int axis = 0; axis < dim; ++axis) follows_fluid_[i][axis] = held[i] >> axis & 1 ? 0.8 * follows_fluid_[i][axis] : 1.0;
     drag_force_[i] /= dt;
     report.drag += drag_force_[i];
   }

@@ -147,7 +147,7 @@ void Kernel<dim>::place(const std::vector<Vec<dim>>& nodes) {
   for (double& w : inv_spline_weight_) w = w > 0 ? 1 / w : 0.0;
   for (const auto& [image, spline] : images_) inv_spline_weight_[image] = inv_spline_weight_[spline];
   if (!resolved_) return;
-  nodes_ = weights_at(nodes);
+  weigh_points(nodes, nodes_);
   inv_node_weight_.assign(carriers(), 1.0);
   inv_node_weight_ = mean(std::vector<double>(nodes.size(), 1.0));
   for (double& w : inv_node_weight_) w = w > 0 ? 1 / w : 0.0;
@@ -209,17 +209,17 @@ void Kernel<dim>::add_row(int node, const std::vector<Vec<dim>>& nodes) {
 template <int dim>
 void Kernel<dim>::weigh(std::span<const Vec<dim>> x, const std::vector<Place<dim>>& places) {
   if (shape_ == Shape::smooth) {
-    grains_ = weights_at(x);
+    weigh_points(x, grains_);
     return;
   }
-  grains_ = {};
+  grains_.carrier.clear(), grains_.weight.clear();
   for (const Place<dim>& place : places)
     for (int a = 0; a <= dim; ++a) grains_.carrier.push_back(mesh_->master[mesh_->elements[place.element][a]]), grains_.weight.push_back(std::max(place.l[a], 0.0));  // below 0 by rounding, on a face
 }
 
 template <int dim>
-auto Kernel<dim>::weights_at(std::span<const Vec<dim>> x) const -> Points {
-  Points points{std::vector<int>(x.size()), std::vector<double>(x.size() * splines)};
+void Kernel<dim>::weigh_points(std::span<const Vec<dim>> x, Points& points) const {
+  points.carrier.resize(x.size()), points.weight.resize(x.size() * splines);
   for (std::size_t i = 0; i < x.size(); ++i) {
     const Splines at = splines_at(x[i]);
     int first = at.first[dim - 1] - first_[dim - 1];
@@ -240,7 +240,6 @@ auto Kernel<dim>::weights_at(std::span<const Vec<dim>> x) const -> Points {
     const double all = 1 / met.sum();
     for (int k = 0; k < splines; k += 4) Eigen::Map<Eigen::Array4d>(b + k) *= all;  // as they were stored: longer ones would wait for memory
   }
-  return points;
 }
 
 template class Kernel<2>;

@@ -90,11 +90,13 @@ class Kernel {
       }
   }
   void add_row(int node, const std::vector<Vec<dim>>& nodes);
-  Points weights_at(std::span<const Vec<dim>> x) const;
+  void weigh_points(std::span<const Vec<dim>> x, Points& points) const;
+  // Sums over points: what images got is their splines' too, all is divided by a weight.
   template <class T>
-  void add_images(std::vector<T>& of_carriers) const {
-    for (const auto& [image, spline] : images_) of_carriers[spline] += of_carriers[image];
-    for (const auto& [image, spline] : images_) of_carriers[image] = of_carriers[spline];
+  void finish(std::vector<T>& sums, const std::vector<double>& inv_weight) const {
+    for (const auto& [image, spline] : images_) sums[spline] += sums[image];
+    for (const auto& [image, spline] : images_) sums[image] = sums[spline];
+    for (std::size_t g = 0; g < sums.size(); ++g) sums[g] *= inv_weight[g];
   }
 
   std::shared_ptr<const Mesh<dim>> mesh_;
@@ -144,8 +146,7 @@ std::vector<T> Kernel<dim>::to_nodes(const std::vector<T>& of_carriers, const T&
     for (std::size_t k = 0; k < sum.size(); ++k) sum[mesh_->master[k]] += of_carriers[k];
   } else {
     std::vector<T> density(of_carriers);
-    for (const auto& [image, spline] : images_) density[spline] += density[image];
-    for (std::size_t g = 0; g < density.size(); ++g) density[g] *= inv_spline_weight_[g];
+    finish(density, inv_spline_weight_);
     for (std::size_t a = 0; a < sum.size(); ++a) {
       T here = zero;
       for (int k = row_start_[a]; k < row_start_[a + 1]; ++k) here += value_[k] * density[spline_[k]];
@@ -161,8 +162,7 @@ template <class T>
 std::vector<T> Kernel<dim>::density(const std::vector<T>& of_grains) const {
   std::vector<T> sum(carriers(), 0.0 * of_grains[0]);
   for (std::size_t i = 0; i < of_grains.size(); ++i) give(static_cast<int>(i), of_grains[i], sum);
-  add_images(sum);
-  for (std::size_t g = 0; g < sum.size(); ++g) sum[g] *= inv_spline_weight_[g];
+  finish(sum, inv_spline_weight_);
   return sum;
 }
 
@@ -173,8 +173,7 @@ std::vector<T> Kernel<dim>::mean(const std::vector<T>& at_nodes) const {
   for (std::size_t a = 0; a < at_nodes.size(); ++a)
     if (mesh_->master[a] == static_cast<int>(a))
       each_weight(nodes_, static_cast<int>(a), [&](int carrier, double weight) { sum[carrier] += weight * masses_[a] * at_nodes[a]; });
-  add_images(sum);
-  for (std::size_t g = 0; g < sum.size(); ++g) sum[g] *= inv_node_weight_[g];
+  finish(sum, inv_node_weight_);
   return sum;
 }
 
